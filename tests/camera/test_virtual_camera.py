@@ -13,6 +13,7 @@ from torchpose.camera._virtual_camera import (
     PathModel,
     body_path,
     from_view,
+    log_magnification,
     memory_frames,
     to_view,
     view_body,
@@ -154,6 +155,8 @@ def test_pixels_go_to_the_view_and_back_and_covariances_follow():
         lambda x: from_view(x, view, MATRIX).sum((0, 1, 2)), seen
     )
     torch.testing.assert_close(slopes, numeric.permute(1, 2, 3, 0, 4))
+    scale = log_magnification(seen, view, MATRIX)
+    torch.testing.assert_close(scale, -slopes.det().abs().log())
 
 
 def test_a_hand_of_before_is_carried_along_with_the_body():
@@ -170,10 +173,10 @@ def test_a_hand_of_before_is_carried_along_with_the_body():
         neck=uv[0, 0, 4], height=uv[0, 0, 3] - uv[0, 0, 4], variance=torch.full((2,), 0.01).double()
     )
     path = body_path(uv, torch.ones(1, 60, 8, dtype=torch.bool), (0, 10), 0, 30.0, model)
-    carried = path.carried(uv[:, :, 0].roll(10, 1), 10)[0, 40:]
+    carried = path.carried(uv[:, :, :1].roll(10, 1), [10])[0, 40:, 0]
     left = uv[0, 30:50, 0] - uv[0, 40:60, 0]
     assert (carried - uv[0, 40:, 0]).norm(dim=-1).max() < 0.25 * left.norm(dim=-1).min()
-    assert math.isclose(float(path.carried(uv[:, :, 0], 0)[0, 5, 0]), float(uv[0, 5, 0, 0]))
+    assert math.isclose(float(path.carried(uv[:, :, :1], [0])[0, 5, 0, 0]), float(uv[0, 5, 0, 0]))
 
 
 @pytest.mark.parametrize("variance", [False, True])
@@ -183,13 +186,13 @@ def test_patterns_at_a_time_are_bounded_and_change_nothing(monkeypatch, variance
     own = 4 + uv[..., 3, :].abs() / 100 if variance else None
     before = body_path(uv, mask, (0, 4), 2, 30.0, MODEL, variance=own)
     seen = []
-    weights = body_view._Regression.weights
+    weights = body_view.Regression.weights
 
     def counted(self, known, more):
         seen.append(len(known) * len(self.measured) ** 2)
         return weights(self, known, more)
 
-    monkeypatch.setattr(body_view._Regression, "weights", counted)
+    monkeypatch.setattr(body_view.Regression, "weights", counted)
     monkeypatch.setattr(body_view, "_NUMBERS_AT_A_TIME", 50_000)
     after = body_path(uv, mask, (0, 4), 2, 30.0, MODEL, variance=own)
     torch.testing.assert_close(after.neck, before.neck)

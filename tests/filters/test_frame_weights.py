@@ -7,7 +7,9 @@ from scipy.stats import multivariate_normal
 
 from tests.filters.oracles import random_covariance, random_mixture, tensor
 from torchpose.errors import InputError
-from torchpose.filters import MixtureKalmanFilter
+from torchpose.filters import MixtureKalmanFilter, _memoryless
+from torchpose.filters._memoryless import frame_evidence
+from torchpose.math._gaussian import kalman_gain
 from torchpose.priors import GaussianMixture
 
 DIM, OBSERVED, POWER = 4, [0, 2, 3], 0.4
@@ -179,3 +181,31 @@ def test_gradients_of_many_frames_without_memory_reach_prior_and_noise(kind):
     leaves = [value.clone().requires_grad_() for value in inputs]
     leaves[3].requires_grad_(kind != "the filter's")
     assert torch.autograd.gradcheck(total, leaves, atol=1e-4, rtol=1e-4, fast_mode=True)
+
+
+def test_the_evidence_alone_is_that_of_the_estimates():
+    model, z, mask = problem()
+    own = tensor([[0.5 + 0.1 * t for t in range(7)]] * 3)[..., None, None] * torch.eye(3)
+    for noise in (None, own.double()):
+        filter_ = make_filter(model, gamma=0.0)
+        frames = filter_.check(tensor(z), torch.as_tensor(mask), noise, None, None)
+        found = frame_evidence(filter_, filter_.weight_rule, frames)
+        expected = filter_(tensor(z), torch.as_tensor(mask), noise).log_evidence
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_gains_are_made_for_a_noise_that_comes_again(monkeypatch):
+    model, z, mask = problem(batch=1)
+    made = []
+    monkeypatch.setattr(
+        _memoryless, "kalman_gain", lambda *args: made.append(args) or kalman_gain(*args)
+    )
+    filter_, seen = make_filter(model, gamma=0.0), torch.ones_like(torch.as_tensor(mask[:, 0]))
+    state, outputs = filter_.init(1), []
+    for noise, count in ((0.5, 0), (0.6, 0), (0.5, 1), (0.5, 1)):
+        own = noise * torch.eye(3, dtype=torch.float64)[None]
+        _, out = filter_.step(state, tensor(z[:, 0]), seen, own, return_cov=True)
+        outputs.append(out)
+        assert len(made) == count
+    for once, again in zip(outputs[0][:4], outputs[2][:4], strict=True):
+        torch.testing.assert_close(once, again, rtol=1e-11, atol=1e-12)

@@ -376,9 +376,8 @@ def test_smoothing_sums_over_all_later_paths():
         states.append(chain.update(states[-1], arm))
 
     def moves(t):
-        return (1 - chain.anew) * chain._walk(
-            directions[t - 1], directions[t]
-        ) + chain.anew * prior[t, :, :, None]
+        walk = chain._walk(*directions[t - 1 : t + 1].flatten(1, 2))[None]
+        return (1 - chain.anew) * walk + chain.anew * prior[t, :, :, None]
 
     def brute(first, last):
         """Return the weights of the hypotheses of frame `first`, given all frames up to `last`."""

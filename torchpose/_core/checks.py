@@ -180,7 +180,7 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
     """
     if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
         raise ShapeError(f"{name} must have shape [..., D, D], got {list(covariance.shape)}")
-    if not values_visible():
+    if not values_visible() or _are_covariances(covariance, tolerance):
         return
     check_finite(name, covariance)
     scale = covariance.abs().amax((-2, -1)).clamp_min(torch.finfo(covariance.dtype).tiny)
@@ -198,6 +198,14 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
             f"{name} must be positive definite, got a matrix that is not at index {index}; "
             "add a small multiple of the identity or drop its dependent dimensions"
         )
+
+
+def _are_covariances(matrices: Tensor, tolerance: float) -> bool:
+    """Return whether all matrices are covariances beyond doubt; NaN and infinite numbers are not."""
+    skew = (matrices - matrices.mT).abs().amax((-2, -1))
+    close = (skew < tolerance * matrices.abs().amax((-2, -1))).all()
+    info = torch.linalg.cholesky_ex((matrices + matrices.mT) / 2).info
+    return bool(close & ~info.any())
 
 
 def refuse_unused(

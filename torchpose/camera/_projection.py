@@ -6,6 +6,7 @@ function is differentiable, takes any dtype and broadcasts over leading dimensio
 
 from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from torchpose.math._rotations import RotationOrder, euler_to_matrix
 from torchpose.math._unscented import unscented_transform
 
 __all__ = [
+    "PixelMap",
     "arm_in_body_frame",
     "arm_in_camera_frame",
     "backproject",
@@ -83,12 +85,10 @@ def backproject(
     """
     check_shape("uvl", uvl, ["...", None, 3])
     check_shape("K", K, ["...", 3, 3])
-    u, v, depth = uvl.unbind(-1)
     # K is triangular, so its inverse needs no solver (there is none for half precision).
-    fx, fy, skew, cx, cy = (e.unsqueeze(-1) for e in intrinsics(K))
-    y = (v - cy) / fy
-    x = (u - cx - skew * y) / fx
-    return torch.stack([x * depth, y * depth, depth.expand_as(x)], -1)
+    depth = uvl[..., 2:]
+    level = (uvl[..., :2] - K[..., None, :2, 2]) @ _inverse_slope(K).mT
+    return torch.cat([level * depth, depth], -1)
 
 
 def lift(
@@ -128,9 +128,7 @@ def map_pixels(
         [..., 2], pixels of the second camera.
     """
     check_shape("uv", uv, ["...", 2])
-    slope = _pixel_slope(K_from, K_to).to(uv)
-    centre_from, centre_to = K_from[..., :2, 2].to(uv), K_to[..., :2, 2].to(uv)
-    return (slope @ (uv - centre_from).unsqueeze(-1)).squeeze(-1) + centre_to
+    return PixelMap.between(K_from, K_to).points(uv)
 
 
 def map_pixel_covariance(
@@ -148,8 +146,38 @@ def map_pixel_covariance(
         [..., 2, 2], squared pixels of the second camera.
     """
     check_shape("covariance", covariance, ["...", 2, 2])
-    slope = _pixel_slope(K_from, K_to).to(covariance)
-    return slope @ covariance @ slope.mT
+    return PixelMap.between(K_from, K_to).covariances(covariance)
+
+
+class PixelMap(NamedTuple):
+    """Affine map from the pixels of one camera to those of another one in the same place.
+
+    Attributes:
+        slope: its linear part, [..., 2, 2]. start, end: the principal points of both cameras, [..., 2].
+    """
+
+    slope: Tensor
+    start: Tensor
+    end: Tensor
+
+    @classmethod
+    def between(cls, K_from: Float[Tensor, "... 3 3"], K_to: Float[Tensor, "... 3 3"]) -> Self:
+        """Return the map K_to K_from^-1 between two cameras; raise `CameraError` unless they are some."""
+        check_intrinsics("K_from", K_from)
+        check_intrinsics("K_to", K_to)
+        inverse = _inverse_slope(K_from)
+        slope = K_to[..., :2, :2].to(inverse) @ inverse
+        return cls(slope, K_from[..., :2, 2], K_to[..., :2, 2])
+
+    def points(self, uv: Float[Tensor, "... 2"]) -> Float[Tensor, "... 2"]:
+        """Return pixels of the first camera in the second one; NaN stays NaN."""
+        slope, start, end = (part.to(uv) for part in self)
+        return (slope @ (uv - start).unsqueeze(-1)).squeeze(-1) + end
+
+    def covariances(self, covariance: Float[Tensor, "... 2 2"]) -> Float[Tensor, "... 2 2"]:
+        """Return covariances of pixels of the first camera in the second one."""
+        slope = self.slope.to(covariance)
+        return slope @ covariance @ slope.mT
 
 
 def check_intrinsics(name: str, K: Tensor) -> None:
@@ -208,14 +236,11 @@ def _check_pose(K: Tensor, R: Tensor, t: Tensor) -> None:
     check_shape("t", t, ["...", 3])
 
 
-def _pixel_slope(K_from: Tensor, K_to: Tensor) -> Tensor:
-    """Return the linear part [..., 2, 2] of K_to K_from^-1."""
-    check_intrinsics("K_from", K_from)
-    check_intrinsics("K_to", K_to)
-    fx, fy, skew, *_ = intrinsics(K_from)
+def _inverse_slope(K: Float[Tensor, "... 3 3"]) -> Float[Tensor, "... 2 2"]:
+    """Return the inverse of the upper left part of a camera matrix: the linear part of K^-1."""
+    fx, fy, skew, *_ = intrinsics(K)
     zero = torch.zeros_like(fx)
-    inverse = torch.stack([1 / fx, -skew / (fx * fy), zero, 1 / fy], -1).unflatten(-1, (2, 2))
-    return K_to[..., :2, :2].to(inverse) @ inverse
+    return torch.stack([1 / fx, -skew / (fx * fy), zero, 1 / fy], -1).unflatten(-1, (2, 2))
 
 
 _CHUNK = 4096  # states at a time: 43 sigma points of 21 numbers each make 30 MB

@@ -6,7 +6,10 @@ moved along with the body. The camera is turned, and zoomed where the body is mu
 until body and prior agree.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,9 +22,12 @@ __all__ = [
     "BodyPath",
     "BodyView",
     "PathModel",
+    "Regression",
     "body_path",
     "from_view",
+    "log_magnification",
     "memory_frames",
+    "path_regression",
     "to_view",
     "view_body",
     "view_jacobian",
@@ -72,17 +78,19 @@ class BodyPath(NamedTuple):
         i = self.lags.index(lag)
         return self.neck[:, :, i], self.height[:, :, i]
 
-    def carried(self, uv: Float[Tensor, "B T 2"], lag: int) -> Float[Tensor, "B T 2"]:
-        """Map pixels from `lag` frames ago to the body's current position.
+    def carried(
+        self, uv: Float[Tensor, "B T H 2"], lags: Sequence[int]
+    ) -> Float[Tensor, "B T H 2"]:
+        """Map pixels from H lags ago to the body's current position.
 
-        It moves along with the neck, and away from it as the body comes nearer:
+        They move along with the neck, and away from it as the body comes nearer:
             u' = n_t + (u - n_{t-lag}) |h_t| / |h_{t-lag}|
         """
-        if lag == 0:
-            return uv
-        (neck, height), (then_neck, then_height) = self.at(0), self.at(lag)
-        ratio = height.norm(dim=-1) / then_height.norm(dim=-1).clamp_min(1e-6)
-        return neck + (uv - then_neck) * ratio.clamp(0.5, 2.0)[..., None]
+        now, then = self.lags.index(0), [self.lags.index(lag) for lag in lags]
+        size = self.height.norm(dim=-1, keepdim=True)
+        ratio = size[:, :, now : now + 1] / size[:, :, then].clamp_min(1e-6)
+        offset = (uv - self.neck[:, :, then]) * ratio.clamp(0.5, 2.0)
+        return self.neck[:, :, now : now + 1] + offset
 
 
 class BodyView(NamedTuple):
@@ -108,6 +116,7 @@ def body_path(
     model: PathModel,
     start: int = 0,
     variance: Float[Tensor, "B T 2"] | None = None,
+    regression: Regression | None = None,
 ) -> BodyPath:
     """Return the neck and head at t - lag, by regression on the measurements from a second ago to `ahead`.
 
@@ -122,9 +131,11 @@ def body_path(
             later frames that may be used. fps: frame rate. model: prior knowledge of head and neck.
         start: first frame that is wanted; those before it are its past. Returned are T - start.
         variance: R of head and neck, pixels squared, if it is not that of `model` throughout.
+        regression: the result of `path_regression` for these, if it is known.
     """
     past = memory_frames(lags, fps)
-    regression = _regression(torch.arange(-past, ahead + 1), lags, fps, model, uv)
+    if regression is None:
+        regression = path_regression(lags, ahead, fps, model, uv)
     anchors = uv[:, :, [_HEAD, _NECK]] - torch.stack([model.neck + model.height, model.neck])
     known = mask[:, :, [_HEAD, _NECK], None].to(uv)
     more = torch.zeros_like(known) if variance is None else (variance - model.variance)[..., None]
@@ -149,7 +160,7 @@ def memory_frames(lags: tuple[int, ...], fps: float) -> int:
     return max(round(MEMORY * fps), *lags)
 
 
-class _Regression(NamedTuple):
+class Regression(NamedTuple):
     """Holds the covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
 
     measured: Tensor
@@ -183,9 +194,11 @@ class _Regression(NamedTuple):
         return torch.cholesky_solve(wanted, torch.linalg.cholesky(cov)).mT
 
 
-def _regression(
-    frames: Tensor, lags: tuple[int, ...], fps: float, model: PathModel, like: Tensor
-) -> _Regression:
+def path_regression(
+    lags: tuple[int, ...], ahead: int, fps: float, model: PathModel, like: Tensor
+) -> Regression:
+    """Return the covariances that `body_path` needs; they depend on no measured pixel."""
+    frames = torch.arange(-memory_frames(lags, fps), ahead + 1)
     times = torch.cat([frames, -torch.tensor(lags)]).to(like) / fps
     pixels = model.scale
     neck = _walk(times, _NECK_SPREAD * pixels, _NECK_SPEED * pixels, _NECK_ACCELERATION * pixels)
@@ -200,7 +213,7 @@ def _regression(
     measured = neck[of_frame[:, None], of_frame] + torch.diag(noise.repeat(n))
     measured = measured + height[of_frame[:, None], of_frame] * is_head * is_head[:, None]
     wanted = torch.cat([neck[n:, of_frame], height[n:, of_frame] * is_head])
-    return _Regression(measured, wanted)
+    return Regression(measured, wanted)
 
 
 def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Tensor:
@@ -246,7 +259,11 @@ def view_body(
     offset = neck - model.neck.to(neck)
     room = _BESIDE * matrix[0, 0] / offset.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     target = model.neck.to(neck) + offset * room.clamp_max(1.0)
-    rotation = _axes(_ray(target, matrix)) @ _axes(_ray(neck, matrix)).mT
+    rays = _homogeneous(torch.stack([target, neck]))
+    # K is triangular, so that its inverse is not needed
+    rays = torch.linalg.solve_triangular(matrix.mT, rays, upper=False, left=False)
+    wanted, current = _axes(rays)
+    rotation = wanted @ current.mT
     seen = height.norm(dim=-1).clamp_min(1e-6)
     farther = (model.height.to(height).norm() / seen).log()
     excess = _excess(farther, *_FARTHER) - _excess(-farther, *_NEARER)
@@ -263,10 +280,6 @@ def _excess(value: Tensor, low: float, high: float) -> Tensor:
     return torch.minimum(line, value.clamp_min(0.0))
 
 
-def _ray(pixel: Float[Tensor, "*batch 2"], matrix: Tensor) -> Float[Tensor, "*batch 3"]:
-    return _homogeneous(pixel) @ torch.linalg.inv(matrix).mT
-
-
 def _axes(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the axes with z along a ray and x level, as columns."""
     z = torch.nn.functional.normalize(ray, dim=-1)
@@ -280,35 +293,46 @@ def to_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "B T J 2"]:
     """Return the pixels of the camera as the virtual camera sees them."""
-    turned = _turned(uv, view.rotation, matrix)
-    return (
-        view.centre[..., None, :]
-        + (turned - view.centre[..., None, :]) * view.zoom[..., None, None]
-    )
+    centre = view.centre[..., None, :]
+    return centre + (_turned(uv, view.rotation, matrix) - centre) * view.zoom[..., None, None]
 
 
 def from_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "B T J 2"]:
     """Return the pixels of the virtual camera as the camera sees them."""
-    shrunk = (
-        view.centre[..., None, :] + (uv - view.centre[..., None, :]) / view.zoom[..., None, None]
-    )
-    return _turned(shrunk, view.rotation.mT, matrix)
+    return _turned(_shrunk(uv, view), view.rotation.mT, matrix)
 
 
 def view_jacobian(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "B T J 2 2"]:
     """Return the derivative of `from_view` at these pixels."""
-    shrunk = (
-        view.centre[..., None, :] + (uv - view.centre[..., None, :]) / view.zoom[..., None, None]
-    )
-    homography = _homography(view.rotation.mT, matrix)[..., None, :, :]
-    top = (homography @ _homogeneous(shrunk)[..., None])[..., 0]
-    value, depth = top[..., :2] / top[..., 2:], top[..., 2, None, None]
-    slopes = homography[..., :2, :2] - value[..., None] * homography[..., 2:, :2]
-    return slopes / depth / view.zoom[..., None, None, None]
+    homography = _homography(view.rotation.mT, matrix)
+    top = _homogeneous(_shrunk(uv, view)) @ homography.mT
+    value, depth = top[..., :2, None] / top[..., 2:, None], top[..., 2:, None]
+    homography = homography[..., None, :, :]
+    slopes = homography[..., :2, :2] - value * homography[..., 2:, :2]
+    return slopes / (depth * view.zoom[..., None, None, None])
+
+
+def log_magnification(
+    uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "B T J"]:
+    """Return the log of the area that a pixel of the camera has in the virtual one, at these pixels.
+
+    It is -log |det J| of `view_jacobian`, where the determinant of a turn about the camera's centre is the
+    inverse cube of the homogeneous coordinate that it divides by.
+    """
+    homography = _homography(view.rotation.mT, matrix)
+    depth = (_homogeneous(_shrunk(uv, view)) @ homography[..., 2:, :].mT)[..., 0]
+    return 3 * depth.abs().log() + 2 * view.zoom.log()[..., None]
+
+
+def _shrunk(uv: Tensor, view: BodyView) -> Tensor:
+    """Return pixels of the virtual camera without its zoom."""
+    centre = view.centre[..., None, :]
+    return centre + (uv - centre) / view.zoom[..., None, None]
 
 
 def _turned(uv: Tensor, rotation: Tensor, matrix: Tensor) -> Tensor:
@@ -318,8 +342,9 @@ def _turned(uv: Tensor, rotation: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _homography(rotation: Tensor, matrix: Tensor) -> Tensor:
-    return matrix @ rotation @ torch.linalg.inv(matrix)
+    """Return K R K^-1."""
+    return torch.linalg.solve_triangular(matrix, matrix @ rotation, upper=True, left=False)
 
 
 def _homogeneous(uv: Tensor) -> Tensor:
-    return torch.cat([uv, torch.ones_like(uv[..., :1])], -1)
+    return torch.nn.functional.pad(uv, (0, 1), value=1.0)

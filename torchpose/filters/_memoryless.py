@@ -6,11 +6,11 @@ states carry nothing over either (transition "ou" with gamma = 0), frames are in
 `run_memoryless` conditions the mixture on all of them at once.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -30,7 +30,7 @@ from torchpose.filters._weights import WeightRule, estimate_of, frame_weights
 from torchpose.math._gaussian import Gain, kalman_gain
 from torchpose.math._geometric_median import median_estimate
 
-__all__ = ["frame_log_likelihood", "run_memoryless", "step_memoryless"]
+__all__ = ["frame_evidence", "frame_log_likelihood", "run_memoryless", "step_memoryless"]
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
@@ -48,8 +48,19 @@ def frame_log_likelihood(
     """
     if not rule.by_frame:
         return None
-    groups = _groups(frames, _SHARED_FRAMES)
+    groups = _groups(model, frames, _SHARED_FRAMES)
     found = [(group.rows, _log_likelihood(model, group)) for group in groups]
+    return _in_order(found).unflatten(0, frames.z.shape[:2])
+
+
+def frame_evidence(
+    model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
+) -> Float[Tensor, "B T"]:
+    """Return the log-evidence of every frame by `run_memoryless`, without estimates."""
+    groups = _groups(model, frames, _SHARED_FRAMES)
+    found = [
+        (group.rows, _weighed(rule, group, _log_likelihood(model, group))[1]) for group in groups
+    ]
     return _in_order(found).unflatten(0, frames.z.shape[:2])
 
 
@@ -74,7 +85,7 @@ def run_memoryless(
     shared = measured_parts(model)
     # a bar that shows nothing would still keep torch.compile out
     bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
-    for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
+    for group in _groups(model, frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
         # Gains and parts that groups share are not among what a gradient computes anew for one of them.
         gain = _gain(model, group) if group.shares_gain else None
         arguments = model, rule, medians, group, gain, shared, return_cov
@@ -108,10 +119,8 @@ def _estimate(
         own = condition_own(model, shared, group.z, group.mask, group.noise)
         log_likelihood, jitter = own.log_likelihood, own.jitter
     else:
-        means, log_likelihood, jitter = _condition(model, group, gain[0])
-    log_weights, evidence = frame_weights(rule, log_likelihood, log_likelihood)
-    measured = group.mask.any(-1)
-    evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
+        means, log_likelihood, jitter = _condition(model, shared, group, gain[0])
+    log_weights, evidence = _weighed(rule, group, log_likelihood)
     if gain is None:
         mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
     else:
@@ -119,6 +128,14 @@ def _estimate(
         if len(medians):
             mean, total = median_estimate(log_weights, means, gain[1], mean, total, medians)
     return mean, log_weights, evidence, total, *mending(mean, jitter)
+
+
+def _weighed(
+    rule: WeightRule, group: "_Group", log_likelihood: Float[Tensor, "N M"]
+) -> tuple[Float[Tensor, "N M"], Float[Tensor, " N"]]:
+    """Return log-weights and log-evidence of a group of frames; 0 where nothing is measured."""
+    log_weights, evidence = frame_weights(rule, log_likelihood, log_likelihood)
+    return log_weights, torch.where(group.mask.any(-1), evidence, 0.0)
 
 
 def step_memoryless(
@@ -133,7 +150,7 @@ def step_memoryless(
     later = state._replace(time=state.time + 1)
     frames = frame.as_sequences()
     if not values_visible():
-        (group,) = _groups(frames, len(frame.z))
+        (group,) = _groups(model, frames, len(frame.z))
         shared = measured_parts(model)
         return later, StepOutput(*_estimate(model, rule, medians, group, None, shared, return_cov))
     out = run_memoryless(model, rule, medians, frames, return_cov)
@@ -161,7 +178,7 @@ class _Group(NamedTuple):
         return self.mask.ndim == 1
 
 
-def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
+def _groups(model: MixtureKalmanFilter, frames: Measurements, at_a_time: int) -> Iterator[_Group]:
     """Yield frames that measure the same dimensions with the same noise, which share their gains."""
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
@@ -169,19 +186,37 @@ def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
         each = frames.cov.expand(len(z), -1, -1) if noise is None else noise
         yield _Group(torch.arange(len(z), device=z.device), z, mask, each)
         return
-    settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
-    if noise is not None and noise.requires_grad:
+    alike = _alike(mask, noise)
+    if noise is not None and not _pays(model, noise, mask, len(alike)):
         yield from _groups_of_own(z, mask, noise)
         return
-    _, group = torch.unique(settings, dim=0, return_inverse=True)
-    sizes = torch.bincount(group)
-    if noise is not None and len(z) > 1 and len(sizes) > len(z) / _LEAST_SHARE:
-        yield from _groups_of_own(z, mask, noise)
-        return
-    for same in group.argsort(stable=True).split(sizes.tolist()):
+    for same in alike:
         own_noise = frames.cov if noise is None else noise[same[0]]
         for rows in same.split(at_a_time):
             yield _Group(rows, z[rows], mask[same[0]], own_noise)
+
+
+def _alike(mask: Bool[Tensor, "N Z"], noise: Float[Tensor, "N Z Z"] | None) -> Sequence[Tensor]:
+    """Return the rows of frames that measure the same dimensions with the same noise, set by set."""
+    settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
+    if len(mask) == 1 or bool((settings == settings[:1]).all()):
+        return [torch.arange(len(mask), device=mask.device)]
+    _, group = torch.unique(settings, dim=0, return_inverse=True)
+    return group.argsort(stable=True).split(torch.bincount(group).tolist())
+
+
+def _pays(
+    model: MixtureKalmanFilter,
+    noise: Float[Tensor, "N Z Z"],
+    mask: Bool[Tensor, "N Z"],
+    n_different: int,
+) -> bool:
+    """Return whether frames with noise of their own gain by making the gains that some of them share."""
+    if noise.requires_grad:
+        return False
+    if len(noise) == 1:
+        return _kept_gains(model).is_asked_again(noise[0], mask[0])
+    return n_different <= len(noise) / _LEAST_SHARE
 
 
 def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
@@ -191,35 +226,45 @@ def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
 
 
 def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, "N M"]:
-    if group.shares_gain:
-        return _condition(model, group, _gain(model, group)[0])[1]
     shared = measured_parts(model)
+    if group.shares_gain:
+        return _whitened(shared, group, _gain(model, group)[0])[1]
     return condition_own(model, shared, group.z, group.mask, group.noise).log_likelihood
 
 
 def _condition(
-    model: MixtureKalmanFilter, group: _Group, gain: Gain
+    model: MixtureKalmanFilter, shared: MeasuredParts, group: _Group, gain: Gain
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], and jitter."""
-    centres = model.means.to(model.dtype)
-    residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
-    white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
-    means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
-    log_likelihood = (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+    white, log_likelihood = _whitened(shared, group, gain)
+    means = torch.baddbmm(model.means.to(model.dtype)[:, None], white.mT, gain.white)
     jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
-    return means, log_likelihood, jitter
+    return means.transpose(0, 1), log_likelihood, jitter
+
+
+def _whitened(
+    shared: MeasuredParts, group: _Group, gain: Gain
+) -> tuple[Float[Tensor, "M Z N"], Float[Tensor, "N M"]]:
+    """Return the innovations over their standard deviations, and log-likelihoods."""
+    residual = (group.z[:, None] - shared.centre.to(group.z)) * group.mask
+    white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
+    return white, (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
 
 
 def _gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
     """Return gain and covariance of every component for frames that share them, kept for later."""
-    sources = (model.means, model.covariances)
-    kept = derived(model, f"frame gains {model.dtype}", sources, _FrameGains)
+    kept = _kept_gains(model)
     found = kept.get(group.noise, group.mask)
     if found is None:
         with outside_inference():
             found = _make_gain(model, group)
         kept.put(group.noise, group.mask, found)
     return found
+
+
+def _kept_gains(model: MixtureKalmanFilter) -> "_FrameGains":
+    sources = (model.means, model.covariances)
+    return derived(model, f"frame gains {model.dtype}", sources, _FrameGains)
 
 
 def _make_gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
@@ -232,6 +277,17 @@ class _FrameGains:
 
     def __init__(self) -> None:
         self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
+        self._asked: dict[tuple[Any, ...], None] = {}
+
+    def is_asked_again(self, noise: Tensor, mask: Tensor) -> bool:
+        """Return whether this pattern and noise came before: gains that are used once do not pay."""
+        key = _key(noise, mask)
+        if key in self._found or key in self._asked:
+            return True
+        if len(self._asked) >= _PATTERNS:
+            self._asked.pop(next(iter(self._asked)))
+        self._asked[key] = None
+        return False
 
     def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
         """Return the stored gains for this pattern and noise, or None."""
@@ -258,6 +314,8 @@ def _key(noise: Tensor, mask: Tensor) -> tuple[Any, ...]:
 
 def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Return the values of all frames in the order of the frames."""
+    if len(parts) == 1:  # of all frames, in their order
+        return parts[0][1]
     rows = torch.cat([rows for rows, _ in parts])
     values = torch.cat([values for _, values in parts])
     return values.index_select(0, rows.argsort())

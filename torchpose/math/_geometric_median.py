@@ -30,14 +30,15 @@ def geometric_median(
         minimum" (1937).
     """
     offsets = (means - start[:, None]).transpose(1, 2).contiguous()  # cancels less, and in order
-    constant = offsets.square().sum(-1) + spread.mT
-    shares, x = weights[:, None], torch.zeros_like(start)
+    constant = (offsets.square().sum(-1) + spread.mT).flatten(0, 1)[..., None]
+    shares = weights[:, None].expand(offsets.shape[:3]).flatten(0, 1)[..., None]
+    offsets = offsets.flatten(0, 1)  # products of batches of one dimension need no broadcasting
+    along, x = offsets.mT, offsets.new_zeros(len(offsets), 3, 1)
     for _ in range(_STEPS):
-        along = (offsets @ x[..., None])[..., 0]
-        squared = constant - 2 * along + x.square().sum(-1, keepdim=True)
+        squared = torch.baddbmm(constant, offsets, x, alpha=-2) + torch.bmm(x.mT, x)
         pull = shares * squared.clamp_min(_LEAST).rsqrt()
-        x = (pull[..., None, :] @ offsets)[..., 0, :] / pull.sum(-1, keepdim=True)
-    return start + x
+        x = torch.bmm(along, pull) / pull.sum(1, keepdim=True)
+    return start + x.reshape(start.shape)
 
 
 def median_columns(points: Int[Tensor, " P"]) -> Int[Tensor, " 3*P"]:

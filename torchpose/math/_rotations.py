@@ -10,11 +10,12 @@ import math
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.arguments import as_pair
 from torchpose._core.checks import check_choice, check_shape
+from torchpose._core.module_state import outside_inference
 
 __all__ = [
     "ROTATION_ORDERS",
@@ -39,6 +40,42 @@ __all__ = [
 
 RotationOrder = Literal["zxy", "zyx"]
 ROTATION_ORDERS: tuple[RotationOrder, ...] = ("zxy", "zyx")
+
+_SINES_AND_COSINES = ("sr", "sp", "sy", "cr", "cp", "cy")
+# The entries of R, row by row, of sines and cosines of roll, pitch and yaw: sums of up to two products.
+_EULER = {
+    "zxy": (
+        ("cr cy", "-sr sp sy"), ("-sr cp",), ("cr sy", "sr sp cy"),
+        ("sr cy", "cr sp sy"), ("cr cp",), ("sr sy", "-cr sp cy"),
+        ("-cp sy",), ("sp",), ("cp cy",),
+    ),
+    "zyx": (
+        ("cr cy",), ("cr sy sp", "-sr cp"), ("cr sy cp", "sr sp"),
+        ("sr cy",), ("sr sy sp", "cr cp"), ("sr sy cp", "-cr sp"),
+        ("-sy",), ("cy sp",), ("cy cp",),
+    ),
+}  # fmt: skip
+
+
+def _euler_terms(order: RotationOrder) -> tuple[Int[Tensor, "3 2 9"], Float[Tensor, "2 9"]]:
+    """Return the three factors of both products of each entry of R, and the signs of these.
+
+    A factor is a place among `_SINES_AND_COSINES`, or behind them where it is 1; the sign of a product that
+    there is not is 0.
+    """
+    factors = torch.full((3, 2, 9), len(_SINES_AND_COSINES))
+    signs = torch.zeros(2, 9, dtype=torch.float64)
+    for entry, products in enumerate(_EULER[order]):
+        for row, product in enumerate(products):
+            names = product.removeprefix("-").split()
+            places = [_SINES_AND_COSINES.index(name) for name in names]
+            factors[: len(names), row, entry] = torch.tensor(places)
+            signs[row, entry] = -1.0 if product.startswith("-") else 1.0
+    return factors, signs
+
+
+with outside_inference():
+    _EULER_TERMS = {order: _euler_terms(order) for order in ROTATION_ORDERS}
 
 
 def euler_to_matrix(
@@ -66,20 +103,10 @@ def euler_to_matrix(
     """
     check_shape("angles", angles, ["...", 3])
     _check_order(order)
-    (sr, sp, sy), (cr, cp, cy) = angles.sin().unbind(-1), angles.cos().unbind(-1)
-    if order == "zxy":
-        rows = [
-            [cr * cy - sr * sp * sy, -sr * cp, cr * sy + sr * sp * cy],
-            [sr * cy + cr * sp * sy, cr * cp, sr * sy - cr * sp * cy],
-            [-cp * sy, sp, cp * cy],
-        ]
-    else:
-        rows = [
-            [cr * cy, cr * sy * sp - sr * cp, cr * sy * cp + sr * sp],
-            [sr * cy, sr * sy * sp + cr * cp, sr * sy * cp - cr * sp],
-            [-sy, cy * sp, cy * cp],
-        ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    factors, signs = _EULER_TERMS[order]
+    known = torch.cat([angles.sin(), angles.cos(), torch.ones_like(angles[..., :1])], -1)
+    first, second, third = known[..., factors.to(angles.device)].unbind(-3)
+    return (signs.to(angles) * first * second * third).sum(-2).unflatten(-1, (3, 3))
 
 
 def matrix_to_euler(

@@ -7,12 +7,14 @@ other arm into the estimate, which a mixture over single poses cannot.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.module_state import outside_inference
 from torchpose.camera._projection import project
 from torchpose.camera._viewpoints import Viewpoints
 from torchpose.camera._virtual_camera import BodyPath
@@ -249,24 +251,17 @@ def window_measurements(
         the order of the window state.
     """
     own, other = _HANDS[side]
-    taken = [(own, lag) for lag in layout.own] + [(other, lag) for lag in layout.other]
-    values, known = [], []
-    for joint, lag in taken:
-        then, seen = _shifted(uv[:, :, joint], mask[:, :, joint], lag)
-        values.append(path.carried(then[:, start:], lag))
-        known.append(seen[:, start:])
-    if not values:
-        shape = (uv.shape[0], uv.shape[1] - start, 0)
-        return uv.new_zeros(*shape, 2), mask.new_zeros(shape)
-    return torch.stack(values, 2), torch.stack(known, 2)
-
-
-def _shifted(
-    uv: Float[Tensor, "B T 2"], mask: Bool[Tensor, "B T"], lag: int
-) -> tuple[Tensor, Tensor]:
-    """Return values `lag` frames ago, missing where that is outside the sequence."""
+    lags = (*layout.own, *layout.other)
+    joints = [own] * len(layout.own) + [other] * len(layout.other)
     n_frames = uv.shape[1]
-    source = torch.arange(n_frames, device=uv.device) - lag
-    inside = (source >= 0) & (source < n_frames)
-    source = source.clamp(0, n_frames - 1)
-    return uv[:, source], mask[:, source] & inside
+    frames = torch.arange(start, n_frames, device=uv.device)[:, None] - _whole(lags, uv.device)
+    inside = (frames >= 0) & (frames < n_frames)
+    frames = frames.clamp(0, n_frames - 1)
+    rows = _whole(tuple(joints), uv.device)
+    return path.carried(uv[:, frames, rows], lags), mask[:, frames, rows] & inside
+
+
+@cache
+def _whole(numbers: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:
+    with outside_inference():
+        return torch.tensor(numbers, dtype=torch.long, device=device)

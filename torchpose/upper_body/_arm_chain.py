@@ -8,7 +8,7 @@ from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -28,7 +28,9 @@ _RATE = 30.0
 _NOTHING = -60.0
 _LEAST = 1e-30  # density
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
-_ROWS = 2048  # directions at a time, so that intermediate results stay in the cache
+# Directions, and arms of which all pairs of directions are compared, at a time: so that intermediate
+# results stay in the cache.
+_ROWS, _ARMS = 2048, 2
 
 
 class ArmInput(NamedTuple):
@@ -111,13 +113,18 @@ class DirectionDensity:
         logs = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         constant = weights.log() - 0.5 * dim * LOG_2PI - logs - log_mass
         constant = constant - 0.5 * (means * pulled).sum(-1)
-        self._constant = constant + math.log1p(-prior.broad)
-        self._pairs = torch.triu_indices(dim, dim, device=device)
-        first, second = self._pairs
+        constant = constant + math.log1p(-prior.broad)
+        first, second = torch.triu_indices(dim, dim, device=device)
         twice = torch.where(first == second, 0.5, 1.0)  # either order of two coordinates counts
         squares = -twice * precision[:, first, second]
-        self._slopes = torch.cat([pulled, squares], 1).mT.contiguous()
+        # the terms: products of two coordinates, of one with 1, and 1
+        alone = torch.arange(dim + 1, device=device)
+        self._first = torch.cat([first, alone])
+        self._second = torch.cat([second, torch.full_like(alone, dim)])
+        self._slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
+        self._slopes_of_all = pad(self._slopes, (0, 1))
+        self._slopes_of_all[-1, -1] = self.broad
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
@@ -130,25 +137,23 @@ class DirectionDensity:
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
-        logs = pad(self._logs(directions.reshape(-1, 6)), (0, 1), value=self.broad)
+        logs = self._terms(directions.reshape(-1, 6)).mT @ self._slopes_of_all
         return torch.softmax(logs, -1).to(directions.dtype).view(*directions.shape[:-1], -1)
 
-    def _logs(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "N K"]:
-        """Return the log-density of each component of the mixture, times its weight.
+    def _terms(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "T N"]:
+        """Return the terms of the polynomials that are the log-densities of the components.
 
-        Its terms cancel, some of a thousand to a few: they are float64.
+        They cancel, some of a thousand to a few: they are float64.
         """
-        columns = rows.double().mT.contiguous()
-        first, second = self._pairs
-        terms = torch.cat([columns, columns[first] * columns[second]])
-        return torch.addmm(self._constant, terms.mT, self._slopes)
+        columns = pad(rows.double(), (0, 1), value=1.0).mT.contiguous()
+        return columns.index_select(0, self._first) * columns.index_select(0, self._second)
 
     def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
         """Return the log-density of the mixture, without its broad part; exponentials are float32."""
-        logs = self._logs(rows)
-        most = logs.amax(-1, keepdim=True).detach()
+        logs = self._terms(rows).mT @ self._slopes
+        most = logs.detach().amax(-1, keepdim=True)
         # exp of what is far below is slow where it is denormal, and adds nothing
-        near = (logs - most).float().clamp_min(_NOTHING).exp()
+        near = logs.sub_(most).float().clamp_min_(_NOTHING).exp_()
         return near.sum(-1).log() + most[:, 0]
 
 
@@ -180,38 +185,58 @@ class ArmChain:
         both = min(around, _BOTH)
         sizes = {(True, True): (angles, angles), (True, False): (angles, around),
                  (False, True): (around, angles), (False, False): (both, both)}  # fmt: skip
-        first, *others = arm.patterns
-        arms = self._weighed(arm, first, sizes[first], count)
-        for ends in others:
-            elbow, hand = (arm.known[..., i] == seen for i, seen in enumerate(ends))
-            found = self._weighed(arm, ends, sizes[ends], count)
-            arms = _where((elbow & hand)[..., None], found, arms)
-        return arms
+        if len(arm.patterns) == 1:
+            (ends,) = arm.patterns
+            return self._weighed(arm, ends, sizes[ends], count)
+        # each arm for its own pattern alone
+        known = arm.known.flatten(0, 1)
+        parts = []
+        for ends in arm.patterns:
+            rows = (known == known.new_tensor(ends)).all(-1).nonzero()[:, 0]
+            parts.append((rows, self._weighed(arm, ends, sizes[ends], count, rows)))
+        order = torch.cat([rows for rows, _ in parts]).argsort()
+        joined = (
+            torch.cat(values, 1)[:, order] for values in zip(*(x for _, x in parts), strict=True)
+        )
+        return Arms(*(value.view(*arm.known.shape[:2], *value.shape[2:]) for value in joined))
 
     def _weighed(
-        self, arm: ArmInput, ends: tuple[bool, bool], sizes: tuple[int, int], count: int
+        self,
+        arm: ArmInput,
+        ends: tuple[bool, bool],
+        sizes: tuple[int, int],
+        count: int,
+        rows: Int[Tensor, " A"] | None = None,
     ) -> Arms:
-        """Return the `count` hypotheses of largest weight, of arms whose elbow and hand are measured so."""
+        """Return the `count` hypotheses of largest weight, of arms whose elbow and hand are measured so.
+
+        Args:
+            arm: the measurements of all arms. ends: whether elbow and hand are measured.
+            sizes: the number of nodes of either bone. count: that of hypotheses. rows: the arms that are
+                meant, which come as those of a single body; None is all of them.
+        """
         elbow, hand = ends
-        lengths, variance = arm.lengths, arm.variance
+
+        def meant(values: Float[Tensor, "B 2 *rest"]) -> Tensor:
+            return values if rows is None else values.flatten(0, 1)[rows][None]
+
+        shoulder, rays, lengths, variance = map(
+            meant, (arm.shoulder, arm.rays, arm.lengths, arm.variance)
+        )
         if elbow:
-            upper = nodes_on_ray(
-                arm.shoulder,
-                arm.rays[..., 0, :],
-                lengths[..., 0],
-                variance[..., 0].sqrt(),
-                sizes[0],
-            )
+            std = variance[..., 0].sqrt()
+            upper = nodes_on_ray(shoulder, rays[..., 0, :], lengths[..., 0], std, sizes[0])
         else:  # the elbow is known as well as its directions are dense
-            upper = nodes_anywhere(arm.shoulder, lengths[..., 0], _sphere(arm.axes, sizes[0]))
+            upper = nodes_anywhere(shoulder, lengths[..., 0], meant(_sphere(arm.axes, sizes[0])))
             grain = (4 * math.pi / sizes[0] / 12) * lengths[..., :1].square()
             variance = variance + grain
         start, length = upper.ends, lengths[..., 1, None]
         if hand:
             std = variance[..., 1, None].sqrt()
-            lower = nodes_on_ray(start, arm.rays[..., None, 1, :], length, std, sizes[1])
+            lower = nodes_on_ray(start, rays[..., None, 1, :], length, std, sizes[1])
         else:
-            lower = nodes_anywhere(start, length, _sphere(arm.axes, sizes[1])[..., None, :, :])
+            sphere = meant(_sphere(arm.axes, sizes[1]))
+            lower = nodes_anywhere(start, length, sphere[..., None, :, :])
         shape = *start.shape[:-1], sizes[1], 3
         bones = upper.directions[..., None, :], lower.directions
         directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
@@ -219,9 +244,8 @@ class ArmChain:
         prior = self.density(directions)
         if weight.shape[-1] <= count:
             return Arms(directions, weight, prior)
-        rows = (weight + prior).topk(count, -1).indices
-        chosen = directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
-        return Arms(chosen, weight.gather(-1, rows), prior.gather(-1, rows))
+        best = (weight + prior).topk(count, -1).indices
+        return Arms(_rows_of(directions, best), weight.gather(-1, best), prior.gather(-1, best))
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -235,7 +259,7 @@ class ArmChain:
         """
         logs = arms.log_weight + arms.log_prior
         logs, rows = logs.topk(min(_LIKELIEST, logs.shape[-1]), -1)
-        chosen = arms.directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
+        chosen = _rows_of(arms.directions, rows)
         weight = torch.softmax(logs, -1)[..., None, :]
         left, right = (weight @ self.density.shares(chosen))[..., 0, :].unbind(1)
         tied = ((left @ self.density.together) * right).sum(-1)
@@ -249,8 +273,7 @@ class ArmChain:
     def update(self, state: ArmState, arms: Arms) -> ArmState:
         """Return the posterior after one more frame."""
         prior = arms.log_prior[:, :, 0].exp()
-        walk = self._walk(state.directions, arms.directions[:, :, 0])
-        moved = (state.weight[..., None, :] @ walk)[..., 0, :]
+        moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0])
         return _belief(arms, prior, (1 - self.anew) * moved + self.anew * prior)
 
     def smoothed(
@@ -287,21 +310,31 @@ class ArmChain:
             after: the backward message at the next frame.
         """
         ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
-        walk = self._walk(state.directions, later.directions)
-        moved = (walk @ ratio[..., None])[..., 0]
+        moved = self._moved(ratio, later.directions, state.directions)
         anew = (later.prior * ratio).sum(-1, keepdim=True)
         message = (1 - self.anew) * moved + self.anew * anew
         return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
 
-    def _walk(self, before: Tensor, after: Tensor) -> Float[Tensor, "B 2 N M"]:
+    def _moved(
+        self, weight: Float[Tensor, "B 2 N"], before: Tensor, after: Float[Tensor, "B 2 M 6"]
+    ) -> Float[Tensor, "B 2 M"]:
+        """Return sum_n w_n t_4(x'_m; x_n, s^2) for the directions x of two frames."""
+        arms = (part.flatten(0, 1).split(_ARMS) for part in (weight[:, :, None], before, after))
+        moved = [torch.bmm(share, self._walk(*pair)) for share, *pair in zip(*arms, strict=True)]
+        return torch.cat(moved).view(*after.shape[:-1])
+
+    def _walk(
+        self, before: Float[Tensor, "A N 6"], after: Float[Tensor, "A M 6"]
+    ) -> Float[Tensor, "A N M"]:
         """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
         scale = self.step**2
         most = 6 / (16 * math.pi**2 * scale**2)
         unit = most**-0.25
         # of two pairs of unit vectors the product is 2 where they agree
-        alike = (before * (-unit / (2 * scale))) @ after.mT
-        far = (alike + unit * (1 + 1 / scale)).clamp_min(unit)
-        return far.square().pow(-2)
+        same = before.new_full((1, 1, 1), unit * (1 + 1 / scale))
+        far = torch.baddbmm(same, before, after.mT, alpha=-unit / (2 * scale))
+        # in place: memory for as many numbers again takes longer than the arithmetic
+        return far.clamp_min_(unit).square_().pow_(-2)
 
     @staticmethod
     def mean_directions(state: ArmState, seen: Bool[Tensor, "B 2"]) -> Float[Tensor, "B 2 2 3"]:
@@ -320,6 +353,16 @@ def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> Arm
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
     return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted)
+
+
+def _rows_of(
+    directions: Float[Tensor, "*batch N 6"], rows: Int[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch K 6"]:
+    """Return some directions of each batch element; whole rows are taken faster than by `gather`."""
+    n = directions.shape[-2]
+    flat = directions.reshape(-1, 6)
+    start = torch.arange(0, len(flat), n, device=rows.device).view(*rows.shape[:-1], 1)
+    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, 6)
 
 
 def _sphere(axes: Float[Tensor, "B M 3 3"], n_points: int) -> Float[Tensor, "B 2 M G 3"]:
@@ -349,8 +392,3 @@ def _signs(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 3"]:
     """Return the signs of the axes by which right arms are mirrored."""
     with outside_inference():
         return torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]], dtype=dtype, device=device)
-
-
-def _where(here: Bool[Tensor, "B 2 1"], new: Arms, old: Arms) -> Arms:
-    picks = zip((here[..., None, None], here[..., None], here[..., None]), new, old, strict=True)
-    return Arms(*(torch.where(mask, a, b) for mask, a, b in picks))

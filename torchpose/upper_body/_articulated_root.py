@@ -161,12 +161,13 @@ def _arm_input(
     noise = given.own + given.stiff / root.depth.mean(1).square()[:, None, None]
     loose = (slack.square() + _SLACK**2)[:, None, None]
     axes = upright_axes(root.turn)
-    turned = axes.mT[:, None]
-    shoulder = mirrored((shoulders[..., None, :] @ turned)[..., 0, :])
-    rays = mirrored(frame.limbs[:, :, None] @ turned)
-    bones = lengths[:, None, None, :2].expand(*shoulder.shape[:3], 2)
+    limbs = frame.limbs[:, :, None].expand(-1, -1, shoulders.shape[2], -1, -1)
+    # the shoulder, then the rays of elbow and hand
+    places = torch.cat([shoulders[..., None, :], limbs], -2) @ axes.mT[:, None]
+    shoulder, rays = mirrored(places).split([1, 2], -2)
+    bones = lengths[:, None, None, :2].expand(*shoulders.shape[:3], 2)
     return ArmInput(
-        shoulder, rays, given.limbs, frame.facts.patterns,
+        shoulder[..., 0, :], rays, given.limbs, frame.facts.patterns,
         noise[:, :, None] * depth.square() + loose, axes, bones,
     )  # fmt: skip
 

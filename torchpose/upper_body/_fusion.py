@@ -5,6 +5,7 @@ from one component to the next show as jitter. `MotionStage` filters (or smooths
 """
 
 from collections.abc import Mapping
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.facade import set_up_facade
-from torchpose._core.module_state import derived
+from torchpose._core.module_state import derived, outside_inference
 from torchpose.camera._projection import (
     arm_in_body_frame,
     join_arms,
@@ -39,6 +40,7 @@ __all__ = [
     "read_out",
     "recalibrated",
     "stage_lag",
+    "turned",
 ]
 
 _LIMB_ENDS = tuple(
@@ -94,15 +96,14 @@ def _on_torso(
 
     The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
     """
-    lifted, pose, covs = [], [], []
-    for out in (left, right):
-        rotation = euler_to_matrix(out.mean[..., 15:18], order)
-        joints = out.mean[..., :15].unflatten(-1, (5, 3))
-        lifted.append(lift(joints, matrix, rotation, out.mean[..., 18:STATE_DIM]))
-        pose.append(out.mean[..., STATE_DIM:].unflatten(-1, (5, 3)))
-        blocks = require_cov(out)[..., STATE_DIM:, STATE_DIM:].unflatten(-1, (5, 3))
-        blocks = blocks.unflatten(-3, (5, 3))
-        covs.append(blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))
+    mean = torch.stack([left.mean, right.mean])
+    cov = torch.stack([require_cov(left), require_cov(right)])
+    rotation = euler_to_matrix(mean[..., 15:18], order)
+    joints = mean[..., :15].unflatten(-1, (5, 3))
+    lifted = lift(joints, matrix, rotation, mean[..., 18:STATE_DIM])
+    pose = mean[..., STATE_DIM:].unflatten(-1, (5, 3))
+    blocks = cov[..., STATE_DIM:, STATE_DIM:].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
+    covs = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
     return onto_torso(join_arms(*pose), join_arms(*covs), join_arms(*lifted))
 
 
@@ -131,10 +132,17 @@ def on_their_rays(
     projected = (hand & ~observed)[..., None] & before
     uv = torch.where(projected, seen[..., :2], reading.uv)
     moved = lift(torch.cat([uv, seen[..., 2:]], -1), matrix, rotation, reading.place)
-    limb = torch.zeros(uv.shape[-2], 1, dtype=torch.bool, device=uv.device)
-    limb[list(_LIMB_ENDS)] = True
-    joints = torch.where(limb & observed[..., None] & before, moved, reading.joints)
+    limb = _limb_ends(uv.device) & observed[..., None]
+    joints = torch.where(limb & before, moved, reading.joints)
     return reading._replace(joints=joints, uv=uv)
+
+
+@cache
+def _limb_ends(device: torch.device) -> Bool[Tensor, "8 1"]:
+    """Return whether each joint is an elbow or a hand."""
+    with outside_inference():
+        rows = [[row in _LIMB_ENDS] for row in range(len(UPPER_BODY))]
+        return torch.tensor(rows, device=device)
 
 
 def in_camera_axes(
@@ -146,9 +154,16 @@ def in_camera_axes(
         reading: poses in the body's frame. order: the order of their angles. place: the place of every
             body, metres, instead of the estimated one.
     """
-    rotation = euler_to_matrix(reading.angles, order)[..., None, :, :]
+    return turned(reading, euler_to_matrix(reading.angles, order), place)
+
+
+def turned(
+    reading: ReadOut, rotation: Float[Tensor, "*batch 3 3"], place: Tensor | None = None
+) -> ReadOut:
+    """Return the result of `in_camera_axes` for the rotation matrices of the angles."""
     at = reading.place if place is None else place.to(reading.place).expand_as(reading.place)
-    joints = (rotation @ reading.joints[..., None])[..., 0] + at[..., None, :]
+    joints = reading.joints @ rotation.mT + at[..., None, :]
+    rotation = rotation[..., None, :, :]
     return reading._replace(joints=joints, covs=rotation @ reading.covs @ rotation.mT)
 
 

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_covariance, check_finite, check_floating, check_shape
+from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.camera._projection import map_pixel_covariance, map_pixels
+from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.errors import InputError
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -22,12 +23,13 @@ from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torc
 
 __all__ = [
     "MeasuredJoints",
-    "append_blocks",
     "arm_measurements",
+    "block_diagonal",
     "check_gaps",
     "check_sequences",
     "in_prior_pixels",
     "joint_covariances",
+    "kept_pixel_maps",
     "known_covariances",
     "measure_joints",
     "pixel_indices",
@@ -186,6 +188,18 @@ def measure_joints(
     return MeasuredJoints(uv, measured, cov)
 
 
+def kept_pixel_maps(camera: PinholeCamera, prior: UpperBodyPrior) -> tuple[PixelMap, PixelMap]:
+    """Return the maps from a camera's pixels to the prior's and back, the same ones as long as they hold."""
+    info = prior.info
+
+    def make() -> tuple[PixelMap, PixelMap]:
+        own, wanted = camera.matrix, info.matrix.to(camera.matrix)
+        return PixelMap.between(own, wanted), PixelMap.between(wanted, own)
+
+    name = ("pixel maps", info.fx, info.fy, info.cx, info.cy)
+    return derived(camera, name, (camera.matrix,), make)
+
+
 def in_prior_pixels(
     keypoints: Float[Tensor, "B T J 2"],
     confidence: Float[Tensor, "B T J"] | None,
@@ -207,17 +221,16 @@ def in_prior_pixels(
     Raises:
         ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
     """
-    own, wanted = camera.matrix.to(keypoints), prior.info.matrix.to(keypoints)
+    to_prior, _ = kept_pixel_maps(camera, prior)
     if covariance is not None:
-        covariance = known_covariances(covariance, keypoints)
-        covariance = map_pixel_covariance(covariance, own, wanted)
+        covariance = to_prior.covariances(known_covariances(covariance, keypoints))
     measured = measure_joints(
         keypoints, confidence, mask, picked.indices, measurement_cov, covariance
     )
-    measured = measured._replace(uv=map_pixels(measured.uv, own, wanted))
+    measured = measured._replace(uv=to_prior.points(measured.uv))
     if max(picked.face) >= 0:
         face = measure_face(keypoints, confidence, mask, picked.face)
-        face = face._replace(places=map_pixels(face.places, own, wanted))
+        face = face._replace(places=to_prior.points(face.places))
         measured = measured._replace(face=face)
     if not picked.middle:
         return measured
@@ -354,19 +367,12 @@ def arm_measurements(
     rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
     z = measured.uv[:, :, rows].flatten(-2)
     mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
-    return z, mask, _block_diagonal(measured.cov[..., rows, :, :])
+    return z, mask, block_diagonal(measured.cov[..., rows, :, :])
 
 
-def _block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
+def block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
+    """Return matrices with these blocks on their diagonals, Z = 2 N."""
     n = blocks.shape[-3]
     eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
-    return torch.einsum("...nij,nm->...nimj", blocks, eye).flatten(-2).flatten(-3, -2)
-
-
-def append_blocks(cov: Float[Tensor, "*batch Z Z"], block: Tensor, count: int) -> Tensor:
-    """Return R with `count` more diagonal blocks."""
-    blocks = torch.block_diag(*[block] * count)
-    n, extra = cov.shape[-1], blocks.shape[-1]
-    whole = cov.new_zeros(*cov.shape[:-2], n + extra, n + extra)
-    whole[..., :n, :n], whole[..., n:, n:] = cov, blocks
-    return whole
+    spread = blocks[..., :, :, None, :] * eye[:, None, :, None]
+    return spread.flatten(-2).flatten(-3, -2)

@@ -33,12 +33,12 @@ from torchpose.upper_body._estimator import (
 from torchpose.upper_body._fusion import (
     MotionStage,
     MotionStageState,
-    in_camera_axes,
     kept_stage,
     on_their_rays,
     read_out,
     recalibrated,
     stage_lag,
+    turned,
 )
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._windows import WindowMixture, WindowState
@@ -228,16 +228,16 @@ def _averaged(
     Args:
         share: the weight of the first. ours, theirs: the two readings. order: the order of their angles.
     """
-    turns = [euler_to_matrix(reading.angles, order) for reading in (ours, theirs)]
-    vectors = matrix_to_quaternion_vector(torch.stack(turns, -3))
-    seen = [in_camera_axes(reading, order) for reading in (ours, theirs)]
+    turns = euler_to_matrix(torch.stack([ours.angles, theirs.angles], -2), order)
+    vectors = matrix_to_quaternion_vector(turns)
+    seen = [turned(*pair) for pair in zip((ours, theirs), turns.unbind(-3), strict=True)]
     mean = mean_rotation(vectors, torch.stack([share, 1 - share], -1))
     rotation = quaternion_vector_to_matrix(mean)
     place = theirs.place.lerp(ours.place, share[..., None])
     back = rotation.mT[..., None, :, :]
     joints, covs = _moments(share, *((reading.joints, reading.covs) for reading in seen))
     uv, uv_covs = _moments(share, *((reading.uv, reading.uv_covs) for reading in (ours, theirs)))
-    joints = (back @ (joints - place[..., None, :])[..., None])[..., 0]
+    joints = (joints - place[..., None, :]) @ rotation
     angles = matrix_to_euler(rotation, order)
     return ReadOut(joints, back @ covs @ back.mT, angles, place, uv, uv_covs)
 

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
 from torchpose.math._rotations import RotationOrder
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -31,6 +30,7 @@ from torchpose.upper_body._fusion import (
     read_out,
     recalibrated,
 )
+from torchpose.upper_body._measured_joints import kept_pixel_maps
 from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._screening import Screened
@@ -127,11 +127,11 @@ class PoseReader(NamedTuple):
     ) -> PoseTrack:
         """Return the result, of poses in the axes that were asked for."""
         left, right = estimates.left, estimates.right
-        matrix, own = (m.to(reading.uv) for m in (self.prior.info.matrix, self.camera.matrix))
+        _, to_camera = kept_pixel_maps(self.camera, self.prior)
         return PoseTrack(
-            joints2d=map_pixels(reading.uv, matrix, own),
+            joints2d=to_camera.points(reading.uv),
             joints3d=reading.joints,
-            covariance2d=map_pixel_covariance(reading.uv_covs, matrix, own),
+            covariance2d=to_camera.covariances(reading.uv_covs),
             covariance3d=reading.covs,
             observed=found.measured.mask,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
@@ -145,7 +145,7 @@ class PoseReader(NamedTuple):
             frame=self.frame,
             notes=(*notes, *mending_notes(left, right)),
             method=self.method,
-            inlier_probability=found.probability.to(matrix),
+            inlier_probability=found.probability.to(reading.uv),
             **_bone_fields(estimates.bones),
         )
 

@@ -6,13 +6,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.module_state import derived
 from torchpose.camera._virtual_camera import (
     BodyView,
     PathModel,
+    Regression,
     body_path,
+    log_magnification,
+    path_regression,
     to_view,
     view_body,
-    view_jacobian,
 )
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, window_measurements
@@ -83,26 +86,45 @@ def see_in_view(
         frames = torch.arange(mask.shape[1], device=mask.device)
         mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
     start = start % mask.shape[1]
-    model = _path_model(prior, measurement_cov, uv)
+    regression: Regression | None
+    model, regression = _kept_path(prior, layout, measurement_cov, uv)
     noise = None
     if measured.cov.ndim > 3:
         noise = _of_anchors(measured.cov)
-    else:
-        model = model._replace(variance=_of_anchors(measured.cov))
-    path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
+    elif measured.cov is not measurement_cov:
+        model, regression = model._replace(variance=_of_anchors(measured.cov)), None
+    path = body_path(
+        uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise, regression
+    )
     neck, height = path.at(0)
     apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
-    reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
+    reach = torch.where(mask[:, start:, _HANDS], apart, 0.0).amax(-1)
     view = view_body(neck, height, model, matrix, reach)
-    hands = {}
-    for side in ARMS:
-        values, known = window_measurements(uv, mask, layout, side, path, start)
-        hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
-    now = to_view(uv[:, start:], view, matrix)
-    now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
+    windows = {side: window_measurements(uv, mask, layout, side, path, start) for side in ARMS}
+    places = torch.cat([uv[:, start:], *(values for values, _ in windows.values())], 2)
+    now, *of_arms = to_view(places, view, matrix).split([uv.shape[2], *[layout.n_hands] * 2], 2)
+    hands = {
+        side: (values.flatten(-2), known.repeat_interleave(2, -1))
+        for values, (side, (_, known)) in zip(of_arms, windows.items(), strict=True)
+    }
+    now = torch.where(mask[:, start:, :, None], now, 0.0)
     cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
-    log_scale = -view_jacobian(now, view, matrix).det().abs().log()
+    log_scale = log_magnification(now, view, matrix)
     return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
+
+
+def _kept_path(
+    prior: UpperBodyPrior, layout: WindowLayout, measurement_cov: Tensor, like: Tensor
+) -> tuple[PathModel, Regression]:
+    """Return the model of head and neck with its regression, the same ones as long as they hold."""
+    sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple(), measurement_cov)
+
+    def make() -> tuple[PathModel, Regression]:
+        model = _path_model(prior, measurement_cov, like)
+        return model, path_regression(layout.lags, layout.ahead, layout.fps, model, like)
+
+    name = ("body path", layout, prior.info.fx, prior.info.fy, like.dtype)
+    return derived(prior, name, sources, make)
 
 
 def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) -> PathModel:

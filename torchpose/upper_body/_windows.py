@@ -13,7 +13,8 @@ from torch import Tensor
 from torchpose._core.module_state import derived
 from torchpose.camera._virtual_camera import memory_frames
 from torchpose.errors import InputError
-from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._fixed_tracks import FixedTrackFilter
+from torchpose.filters._memoryless import frame_evidence
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -33,8 +34,7 @@ from torchpose.upper_body._estimator import (
 )
 from torchpose.upper_body._measured_joints import (
     MeasuredJoints,
-    append_blocks,
-    arm_measurements,
+    block_diagonal,
     pixel_indices,
 )
 from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
@@ -160,27 +160,34 @@ class WindowMixture(Estimator):
         """Return the estimates of frames; their evidence is that of each frame given its window."""
         arms = {}
         for side, arm in ARMS.items():
-            both, noise, hands = _window_inputs(
-                seen, self.window, side, joints[side], self.model.measurement_cov
-            )
+            given = self._given(seen, side, joints[side])
             model = self._filter(side, joints[side])
-            out = model(*both, noise, lengths=lengths, return_cov=True, progress=progress)
+            out = model(*given, lengths=lengths, return_cov=True, progress=progress)
             if self.of_limbs:
-                context, told = self._torso(seen, side, joints[side], lengths), arm[:_N_LIMB]
+                torso = tuple(x for x in joints[side] if x not in ARM_JOINTS[:_N_LIMB])
+                context, told = self._evidence(seen, side, torso, lengths), arm[:_N_LIMB]
             else:
-                context, told = self._filter(side, ())(*hands, None, lengths=lengths), arm
+                context, told = self._evidence(seen, side, (), lengths), arm
             arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
         return Estimates(arms["left"], arms["right"], seen.view)
 
-    def _torso(
+    def _evidence(
         self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
-    ) -> FilterOutput:
-        """Return the estimates of an arm given its torso and the hands of the window alone."""
-        torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
-        both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
-        return self._filter(side, torso)(*both, noise, lengths=lengths)
+    ) -> Float[Tensor, "B T"]:
+        """Return the log-evidence of some joints of an arm and the hands of the window."""
+        model = self._filter(side, joints)
+        frames = model.check(*self._given(seen, side, joints), lengths, None)
+        return frame_evidence(model, model.weight_rule, frames)
 
-    def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
+    def _given(
+        self, seen: SeenInView, side: str, joints: tuple[str, ...]
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return values, mask and R of some joints of an arm and of the hands of the window."""
+        cov = self.model.measurement_cov
+        noise = _window_noise(seen, self.window, side, joints, cov) if joints else None
+        return *_window_inputs(seen, side, joints), noise
+
+    def _filter(self, side: str, joints: tuple[str, ...]) -> FixedTrackFilter:
         """Return the filter of an arm; made once for its prior, noise and settings."""
         window, cov = self.window, self.model.measurement_cov
         mixture: GaussianMixture = getattr(window, side)
@@ -221,13 +228,13 @@ def _window_filter(
     measurement_cov: Float[Tensor, "8 2 2"],
     likelihood_power: float,
     dtype: torch.dtype,
-) -> MixtureKalmanFilter:
+) -> FixedTrackFilter:
     """Return the filter of fixed tracks over windows that measures these joints and a window's hands."""
-    arm, layout = ARMS[side], window.layout
-    blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+    layout = window.layout
+    blocks = [*measurement_cov[_rows(side, joints)]]
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
-    return MixtureKalmanFilter(
+    return FixedTrackFilter(
         getattr(window, side),
         torch.ones(layout.dim, dtype=torch.float64),
         torch.block_diag(*blocks),
@@ -248,26 +255,40 @@ def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor
 
 
 def _window_inputs(
+    seen: SeenInView, side: str, joints: tuple[str, ...]
+) -> tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]]:
+    """Return values and mask of some joints of an arm, and of the hands of the window."""
+    rows = _rows(side, joints)
+    hands, known = seen.hands[side]
+    z, mask = seen.measured.uv[:, :, rows], seen.measured.mask[:, :, rows]
+    mask = mask[..., None].expand(z.shape).flatten(-2)
+    return torch.cat([z.flatten(-2), hands], -1), torch.cat([mask, known], -1)
+
+
+def _window_noise(
     seen: SeenInView,
     window: WindowPrior,
     side: str,
     joints: tuple[str, ...],
     measurement_cov: Float[Tensor, "8 2 2"],
-) -> tuple[
-    tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]],
-    Tensor,
-    tuple[Float[Tensor, "B T H"], Bool[Tensor, "B T H"]],
-]:
-    """Return values and mask of joints and hands, their R, and values and mask of the hands alone."""
-    z, mask, cov = arm_measurements(ARMS[side], joints, seen.measured)
-    hands, known = seen.hands[side]
-    noise = append_blocks(cov, _hand_cov(window, side, measurement_cov), hands.shape[-1] // 2)
-    return (torch.cat([z, hands], -1), torch.cat([mask, known], -1)), noise, (hands, known)
+) -> Tensor | None:
+    """Return R of `_window_inputs`; None where it is that of the filter."""
+    if seen.measured.cov is measurement_cov:
+        return None
+    own = seen.measured.cov[..., _rows(side, joints), :, :]
+    hand = _hand_cov(window, side, measurement_cov)
+    hands = hand.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
+    return block_diagonal(torch.cat([own, hands], -3))
+
+
+def _rows(side: str, joints: tuple[str, ...]) -> list[int]:
+    """Return which of the eight joints these of an arm are."""
+    return [ARMS[side][ARM_JOINTS.index(joint)] for joint in joints]
 
 
 def _pose_of_window(
     out: FilterOutput,
-    context: FilterOutput,
+    context: Float[Tensor, "B T"],
     seen: SeenInView,
     arm: tuple[int, ...],
     layout: WindowLayout,
@@ -278,7 +299,7 @@ def _pose_of_window(
     density over pixels of the prior's camera, not of the virtual one.
     """
     measured = seen.measured.mask[:, :, list(arm)]
-    evidence = out.log_evidence - context.log_evidence
+    evidence = out.log_evidence - context
     evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
     evidence = torch.where(measured.any(-1), evidence, torch.zeros_like(evidence))
     kept = torch.tensor([*range(STATE_DIM), *layout.in_torso], device=out.mean.device)
