@@ -16,7 +16,11 @@ from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.body._skeleton import BODY_15
-from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.math._rotations import (
+    minimal_rotation,
+    quaternion_vector_to_matrix,
+    rotvec_to_matrix,
+)
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
     BodyGaussian,
@@ -46,6 +50,8 @@ _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
 _LOG_ODDS, _DOUBT = -6.0, -5.0
 _TRUNK = (("left_shoulder", "right_shoulder", "neck", "head"), ("left_hip", "right_hip", "pelvis"))
+_SIDED = ("shoulder", "hip")
+_LEAST_WIDTH = 0.05  # metres between left and right that tell a direction
 _TRUNK_SHARE, _BODY_SHARE = 0.28, 0.9  # of the height: from hips to shoulders, from ankles to head
 _DEFAULT_HEIGHT = 1.7
 
@@ -60,7 +66,7 @@ class Start(NamedTuple):
 def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
     """Return the likeliest hypotheses of a start.
 
-    Several cameras see the pose, so that it is corrected from limbs at their centres, at `_HEADINGS` headings. One
+    Several cameras see the pose, so that it is corrected from limbs along triangulated bones, at several headings. One
     camera does not: there every component of the pose prior is a hypothesis of its own, and the best heading of
     each is kept.
 
@@ -69,7 +75,9 @@ def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
     """
     maps, body, motion = filter.maps, filter.articulation, filter.motion
     if len(maps.shift) > 1:
-        points = _points(body, motion, maps, triangulate(maps, frame), _HEADINGS)
+        joints = triangulate(maps, frame)
+        points = _points(body, motion, maps, joints, _HEADINGS)
+        points = _along_limbs(body, points, joints)
         kinds, log_prior = 1, points.position.new_zeros(1)
         state = filter.pulled(_state(points, _initial_cov(motion)[None], maps), 1.0)
     else:
@@ -197,8 +205,7 @@ def _points(
     up = torch.where((top - low).isfinite(), top - low, image_up)
     up = torch.nn.functional.normalize(up, dim=-1)
     position = torch.where(low.isfinite(), low, joints.nanmean(1)).nan_to_num()
-    least = torch.nn.functional.one_hot(up.abs().argmin(-1), 3).to(up)
-    side = torch.nn.functional.normalize(torch.linalg.cross(least, up), dim=-1)
+    side = _leftwards(articulation, joints, up)
     trunk = torch.stack([side, up, torch.linalg.cross(side, up)], -1)
     angles = torch.arange(n_headings).to(up) * (2 * math.pi / n_headings)
     headings = rotvec_to_matrix(angles[:, None] * torch.tensor([0.0, 1.0, 0.0]).to(up))
@@ -212,6 +219,46 @@ def _points(
         motion.scale_mean.to(up).expand(count, -1),
         up.new_zeros(count, len(articulation.shifted), 3),
     )
+
+
+def _leftwards(
+    articulation: Articulation, joints: Float[Tensor, "B J 3"], up: Float[Tensor, "B 3"]
+) -> Float[Tensor, "B 3"]:
+    """Return the direction from right to left shoulder and hip, across an axis; any where they are not known."""
+    left, right = (
+        torch.stack([joints[:, articulation.skeleton.joint(f"{side}_{name}")] for name in _SIDED])
+        for side in ("left", "right")
+    )
+    apart = (left - right).nanmean(0).nan_to_num()
+    apart = apart - (apart * up).sum(-1, keepdim=True) * up
+    least = torch.nn.functional.one_hot(up.abs().argmin(-1), 3).to(up)
+    known = apart.norm(dim=-1, keepdim=True) > _LEAST_WIDTH
+    side = torch.where(known, apart, torch.linalg.cross(least, up))
+    return torch.nn.functional.normalize(side, dim=-1)
+
+
+def _along_limbs(
+    body: Articulation, points: BodyPoint, joints: Float[Tensor, "B J 3"]
+) -> BodyPoint:
+    """Return the points with limbs swung to the bones between known joints; others stay at their centres."""
+    skeleton = body.skeleton
+    joints = joints.repeat_interleave(len(points.position) // len(joints), 0)
+    rotations = points.rotations.clone()
+    for level in skeleton.part_levels[1:]:
+        limbs = [part for part in level if part in body.limb_parts]
+        if not limbs:
+            continue
+        ends = [skeleton.part_of.index(part) for part in limbs]
+        bones = joints[:, ends] - joints[:, [skeleton.parents[end] for end in ends]]
+        world = body.world_rotations(points._replace(rotations=rotations))
+        above = world[:, [skeleton.part_parents[part] for part in limbs]] @ body.centres[limbs]
+        seen = (above.mT @ bones[..., None]).squeeze(-1)
+        rest = body.offsets[ends].expand_as(seen)
+        swing = quaternion_vector_to_matrix(
+            minimal_rotation(rest, torch.where(seen.isfinite(), seen, rest))
+        )
+        rotations[:, limbs] = swing
+    return points._replace(rotations=rotations)
 
 
 def _initial_cov(motion: BodyMotion) -> Float[Tensor, "N N"]:
