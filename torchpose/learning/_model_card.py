@@ -236,7 +236,7 @@ def _views(views: Mapping[str, Any]) -> str:
     return f"{angles}, {shifts}"
 
 
-BodyModel = BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank
+BodyModel = BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank | BodyMotion
 
 _LIMITS = (
     "It is not to be scored on the persons named above, and `torchpose evaluate` refuses that. It says "
@@ -248,7 +248,7 @@ def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
     """Return Markdown text on what a model is, what it was fitted to, and what it is not good for.
 
     Args:
-        model: a manifold, limb conditionals, an action space or a bank.
+        model: a manifold, limb conditionals, an action space or bank, or a prior over the motion of bodies.
         name: of the model, where its file does not say. results: what it scored on persons whom it was
             not fitted on, as Markdown.
     """
@@ -341,11 +341,42 @@ def _bank(bank: Any) -> _Told:
     return what, rows, _gates(info.extra.get("accepted", {})), use, limits
 
 
+def _body_motion(motion: Any) -> _Told:
+    info, found = motion.info, motion.info.extra.get("held_out")
+    settings = info.extra.get("settings", {})
+    n_poses = len(motion.poses.weights)
+    what = (
+        "How fast position and angles of a body accelerate and how their velocities decay "
+        "(Ornstein-Uhlenbeck processes), how far neck, shoulders and hips shift from rigid parts, mean and "
+        f"covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians over the angles "
+        "of all parts, half of them mirror images of the others. The Kalman filter over bodies from keypoints "
+        "uses it. Every set of recordings counts alike, except that poses have shares as the roots of durations."
+    )
+    held_out = ""
+    if found:
+        held_out = (
+            f"Persons who were held out ({found['frames']:,} frames) accelerate {found['acceleration']:.2f} "
+            f"times as much as the prior has it. The log density of their poses is {found['log_density']:.2f} "
+            f"an angle, that of the persons above {found['fitted_log_density']:.2f}."
+        )
+    rows = {
+        "frames": f"{info.n_frames:,}",
+        "frame rate of its velocities": _rate(info.fps),
+        "settings": ", ".join(f"{key} {value:g}" for key, value in sorted(settings.items())),
+    }
+    limits = (
+        "It knows how these persons moved and what they did. Faster motion is followed late, and poses unlike "
+        "theirs are taken for others where cameras see little."
+    )
+    return what, rows, held_out, "", limits
+
+
 _DESCRIBED: Mapping[type, Any] = {
     BackConstrainedGPLVM: _manifold,
     LimbConditionals: _limbs,
     ActionSpace: _action,
     ActionBank: _bank,
+    BodyMotion: _body_motion,
 }
 
 

@@ -30,6 +30,7 @@ class BodyMotionInfo:
     Attributes:
         name: the name of the prior. persons: ids of the persons in the recordings. actions: what they did.
         sources: recordings or data sets. licence: the licence of the data. command: that made it.
+        fps: frames per second at which motion was looked at. n_frames: frames of all recordings.
         extra: anything else that JSON can hold.
     """
 
@@ -39,6 +40,8 @@ class BodyMotionInfo:
     sources: tuple[str, ...] = ()
     licence: str = ""
     command: str = ""
+    fps: float | None = None
+    n_frames: int = 0
     extra: dict[str, Any] = field(default_factory=dict)
 
 
