@@ -153,6 +153,12 @@ class Articulation(nn.Module):
         root = int((self.axis_part == 0).sum())
         return turns[..., self.axis_part[root:], self.axis[root:]]
 
+    def scales_of(self, lengths: Float[Tensor, "*batch J"]) -> Float[Tensor, "*batch G"]:
+        """Return the logarithms of bone lengths over the standard ones, both sides averaged."""
+        logs = (lengths[..., 1:] / self.offsets[1:].norm(dim=-1)).log()
+        members = self.in_group[1:]
+        return (logs @ members) / members.sum(0)
+
     def _carriers(self) -> Float[Tensor, "J N"]:
         """Return which columns directly move a joint: the angles and shift of its bone, and their velocity."""
         n, at = len(self.skeleton.names), self.columns

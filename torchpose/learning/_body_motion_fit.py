@@ -33,7 +33,7 @@ __all__ = [
     "pose_log_density",
 ]
 
-_NEAR, _FAR = 1 / 15, 1 / 6  # seconds, lags between which velocities tell their decay
+_NEAR, _FAR = 1 / 30, 1 / 15  # seconds, lags between which velocities tell their decay
 _DECAYS = (0.3, 15.0)  # per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5
 _GLITCHES = 0.005  # share of frames whose changes count no more than those of the others
@@ -401,11 +401,9 @@ def _scales_of_set(
 ) -> Float[Tensor, "N G"]:
     """Return the scales of every person of a set; NaN where the set lacks the joint."""
     persons = {s.person: s.lengths for s in sequences}
-    standard = articulation.offsets.norm(dim=-1)
-    ratio = (torch.stack(list(persons.values())).to(standard) / standard)[:, 1:].log()
-    ratio = torch.where(_known_joints(sequences)[1:], ratio, torch.nan)
-    groups = articulation.in_group[1:]
-    return torch.stack([ratio[:, column > 0].mean(-1) for column in groups.mT], -1)
+    scales = articulation.scales_of(torch.stack(list(persons.values())).double())
+    lacking = (~_known_joints(sequences)).double() @ articulation.in_group
+    return torch.where(lacking > 0, torch.nan, scales)
 
 
 def _filled(away: Float[Tensor, "N G"]) -> Tensor:

@@ -11,6 +11,7 @@ from typing import Any
 from torchpose._core.files import atomic_path
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -259,13 +260,17 @@ def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
         "Fitted on": card_table({**_body_data(model.info), **rows}),
         "Held out while it was fitted": held_out,
         "On persons that it was not fitted on": results,
-        "Use": f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {use} --out result\n```",
+        "Use": use,
         "Limits": f"{limits} {_LIMITS}",
     }
     return card_text(getattr(model.info, "name", "") or name or "Body model", sections)
 
 
 _Told = tuple[str, dict[str, Any], str, str, str]
+
+
+def _tracking(options: str) -> str:
+    return f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {options} --out result\n```"
 
 
 def _manifold(manifold: Any) -> _Told:
@@ -289,7 +294,7 @@ def _manifold(manifold: Any) -> _Told:
         "It knows one motion. Somebody who does anything else is pulled towards it, and poses that are "
         "not of the motion come out wrong."
     )
-    return what, rows, held_out, f"--manifold {_call(info.name)}", limits
+    return what, rows, held_out, _tracking(f"--manifold {_call(info.name)}"), limits
 
 
 def _limbs(limbs: Any) -> _Told:
@@ -311,7 +316,7 @@ def _limbs(limbs: Any) -> _Told:
         "It knows how these persons moved in these actions; limbs in other positions or faster ones are "
         "followed late or not at all."
     )
-    return what, rows, held_out, f"--method root --conditionals {_call(info.name)}", limits
+    return what, rows, held_out, _tracking(f"--method root --conditionals {_call(info.name)}"), limits
 
 
 def _action(space: Any) -> _Told:
@@ -323,7 +328,7 @@ def _action(space: Any) -> _Told:
     held_out = _gates({info.name: accepted} if accepted is not None else {})
     rows = {"performances": info.performances, "frame rate": _rate(info.fps)}
     limits = "Somebody who does anything else is held in the postures of this action."
-    return what, rows, held_out, f"--method constrained --action {_call(info.name)}", limits
+    return what, rows, held_out, _tracking(f"--method constrained --action {_call(info.name)}"), limits
 
 
 def _bank(bank: Any) -> _Told:
@@ -337,7 +342,7 @@ def _bank(bank: Any) -> _Told:
         "It knows these actions; what is done otherwise is taken for one of them or for none, when the "
         "constraint is released."
     )
-    use = f"--method constrained --action {_call(info.name)}"
+    use = _tracking(f"--method constrained --action {_call(info.name)}")
     return what, rows, _gates(info.extra.get("accepted", {})), use, limits
 
 
@@ -368,7 +373,8 @@ def _body_motion(motion: Any) -> _Told:
         "It knows how these persons moved and what they did. Faster motion is followed late, and poses unlike "
         "theirs are taken for others where cameras see little."
     )
-    return what, rows, held_out, "", limits
+    use = f"```python\nmotion = torchpose.load_body_motion({(info.name or 'FILE')!r})\n```"
+    return what, rows, held_out, use, limits
 
 
 _DESCRIBED: Mapping[type, Any] = {
