@@ -64,7 +64,7 @@ class BodyMotionRecipe:
     n_components: int = 24
     n_samples: int = 12000
     covariance_floor: float = 9e-4
-    acceleration_scale: float = 1.0
+    acceleration_scale: float = 1.25
     least_shift: float = 0.01
     pull_time: float = 1.0
     seed: int = 0

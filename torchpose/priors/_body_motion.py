@@ -18,9 +18,7 @@ from torchpose.errors import PriorError
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["BodyMotion", "BodyMotionInfo", "PosePull", "shipped_body_motion"]
-
-_SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "bodies" / "whole-body.safetensors"
+__all__ = ["BodyMotion", "BodyMotionInfo", "PosePull"]
 
 
 @dataclass(frozen=True)
@@ -174,8 +172,3 @@ class BodyMotion(nn.Module):
         given = {name: value.double() for name, value in tensors.items()}
         poses = GaussianMixture(*(given.pop(n) for n in ("weights", "means", "covariances")))
         return cls(**given, poses=poses, info=info)
-
-
-def shipped_body_motion() -> BodyMotion:
-    """Return the prior over bodies that comes with the package."""
-    return BodyMotion.load(_SHIPPED)

@@ -1,0 +1,77 @@
+"""The prior over the motion of bodies: its file, what it refuses, and how poses pull."""
+
+import pytest
+import torch
+
+from tests.priors.mixtures import random_mixture
+from torchpose import load_body_motion
+from torchpose.body._articulation import Articulation
+from torchpose.errors import FileFormatError, PriorError, ShapeError
+from torchpose.priors import GaussianMixture
+from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
+
+
+def some_motion(**changed) -> BodyMotion:
+    body = Articulation()
+    n_angles = body.relative_columns.stop - body.relative_columns.start
+    given = {
+        "acceleration": torch.full((body.n_pose,), 3.0).double(),
+        "decay": torch.full((body.n_pose,), 4.0).double(),
+        "shift_std": torch.full((len(body.shifted),), 0.02).double(),
+        "shift_time": torch.tensor([0.5]).double(),
+        "pull_time": torch.tensor([1.0]).double(),
+        "scale_mean": torch.zeros(len(body.groups)).double(),
+        "scale_cov": 0.01 * torch.eye(len(body.groups)).double(),
+        "poses": random_mixture(3, n_angles),
+    }
+    return BodyMotion(**(given | changed))
+
+
+def test_a_file_brings_it_back(tmp_path):
+    info = BodyMotionInfo("mine", ("a#1",), ("walk",), ("a",), "CC0", "made", 30.0, 7, {"x": 1})
+    one = some_motion(info=info)
+    path = tmp_path / "body.safetensors"
+    one.save(path)
+    for two in (BodyMotion.load(path), load_body_motion(path)):
+        assert two.info == info
+        for name, value in one.state_dict().items():
+            torch.testing.assert_close(two.state_dict()[name], value, rtol=1e-6, atol=1e-9)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:200])
+    with pytest.raises(FileFormatError, match="body-motion"):
+        BodyMotion.load(path)
+    path.write_bytes(whole.replace(b"torchpose-body-motion", b"torchpose-body-notion"))
+    with pytest.raises(FileFormatError, match="body-motion"):
+        BodyMotion.load(path)
+
+
+def test_the_shipped_one_is_of_the_body_that_is_tracked():
+    motion = load_body_motion("whole-body")
+    assert motion.articulation.n_pose == len(motion.acceleration)
+    assert bool((motion.shift_std[1:3] == motion.shift_std[3:5]).all())
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "said"),
+    [
+        ({"decay": torch.zeros(27).double()}, PriorError, "decay must be positive"),
+        ({"acceleration": torch.ones(3).double()}, ShapeError, "acceleration"),
+        ({"shift_std": torch.ones(9).double()}, ShapeError, "shift_std"),
+        ({"scale_cov": torch.eye(2).double()}, ShapeError, "scale_cov"),
+        ({"poses": random_mixture(2, 5)}, ShapeError, "means"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changed, error, said):
+    with pytest.raises(error, match=said):
+        some_motion(**changed)
+
+
+def test_a_single_gaussian_pulls_by_its_information():
+    g = torch.Generator().manual_seed(0)
+    poses = random_mixture(1, 24)
+    motion = some_motion(poses=GaussianMixture(*poses.parameters_tuple()))
+    angles = torch.randn(5, 24, generator=g, dtype=torch.float64)
+    pull = motion.pull(angles, 0.1 * torch.eye(24).double().expand(5, 24, 24))
+    information = torch.linalg.inv(poses.covariances[0])
+    torch.testing.assert_close(pull.curvature, information.expand(5, 24, 24))
+    torch.testing.assert_close(pull.slope, (poses.means - angles) @ information)
