@@ -68,14 +68,20 @@ class BodyMotionFit(BodyFit):
     ) -> None:
         super().__init__()
         self._recipe = BodyMotionRecipe(
-            n_components, n_samples, covariance_floor, acceleration_scale, least_shift, pull_time, seed
+            n_components,
+            n_samples,
+            covariance_floor,
+            acceleration_scale,
+            least_shift,
+            pull_time,
+            seed,
         )
         self.save_hyperparameters(asdict(self._recipe))
 
     def training_step(self, batch: int, batch_idx: int) -> None:
         """Fit the prior; the fit is repeated where the file is written, since it takes little time."""
         _, held_out = fit_motion(self.gathered, self._recipe)
-        found = {"frames": sum(len(s.residual) for s in self.gathered.train)}
+        found: dict[str, float] = {"frames": sum(len(s.residual) for s in self.gathered.train)}
         if held_out is not None:
             found = {"acceleration": held_out.acceleration, "log_density": held_out.log_density}
         self.log_dict({k: torch.tensor(v).double() for k, v in found.items()}, on_step=True)

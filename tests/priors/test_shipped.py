@@ -23,7 +23,12 @@ LOADERS = {
     "actions": load_action,
     "bodies": load_body_motion,
 }
-FITTED_BY = {"manifolds": "manifold", "conditionals": "limbs", "actions": "actions", "bodies": "body"}
+FITTED_BY = {
+    "manifolds": "manifold",
+    "conditionals": "limbs",
+    "actions": "actions",
+    "bodies": "body",
+}
 SHIPPED = [(kind, name) for kind in KINDS for name in known_models(kind)]
 RESULTS = "## On persons that it was not fitted on\n\n"
 

@@ -1,4 +1,4 @@
-"""`torchpose fit manifold|limbs|actions|body`: what the body trackers learn, from recordings of whole bodies."""
+"""`torchpose fit manifold|limbs|actions|body`: what body trackers learn from recordings of whole bodies."""
 
 import shlex
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""What `torchpose info` says of models of whole bodies (manifolds, limbs, actions, bodies) and of their poses."""
+"""What `torchpose info` says of models of whole bodies (manifolds, limbs, actions, motion) and of poses."""
 
 import math
 from collections.abc import Callable
@@ -120,7 +120,11 @@ def describe_body_motion(path: Path) -> Facts:
         "angles": "\n".join(
             f"{body.skeleton.parts[part]} about {'xyz'[axis]}: {q:.2g} rad per s^1.5, decay {beta:.2g} per s"
             for part, axis, q, beta in zip(
-                body.axis_part.tolist(), body.axis.tolist(), acceleration[3:], decay[3:], strict=True
+                body.axis_part.tolist(),
+                body.axis.tolist(),
+                acceleration[3:],
+                decay[3:],
+                strict=True,
             )
         ),
         "shifts": ", ".join(f"{body.skeleton.names[j]} {100 * std:.1f} cm" for j, std in shifts),

@@ -1,7 +1,7 @@
 """Fit what `BodyMotion` holds to recorded bodies: how they move, which poses they take, how they are built.
 
-Every set of recordings is looked at by itself, and the sets are then combined with equal weight, so that a large
-one does not decide. A set says nothing about parts whose joint it lacks. Left and right are one.
+Every set of recordings is looked at by itself, and the sets are then combined with equal weight, so that a
+large one does not decide. A set says nothing about parts whose joint it lacks. Left and right are one.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchpose._core.checks import check_rate
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -38,7 +38,7 @@ _DECAYS = (0.3, 15.0)  # per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5
 _GLITCHES = 0.005  # share of frames whose changes count no more than those of the others
 _SHIFT_LAG = 0.2  # seconds
-_SHIFT_TIMES = (0.05, 5.0)  # seconds
+_SHIFT_TIMES = (0.05, 5.0)  # seconds; the shape of a person is for ever
 _USUAL_SHIFT_TIME = 0.5  # seconds, where trunks are rigid
 _RIGID = 1e-4  # metres
 _POSE_RATE = 10.0  # frames per second that poses are drawn from
@@ -85,9 +85,9 @@ class MotionSequence(NamedTuple):
 
     Attributes:
         origin: the set that the recording is of. person: its id. fps: frames per second.
-        point: [T], on the manifold of the articulation. residual: [T, S, 3], metres, of recorded joints of the
-            trunk from where its rigid parts have them, part axes. lengths: [J], metres, of the person's bones.
-        known: [J], whether the set has the joint.
+        point: [T], on the manifold of the articulation. residual: [T, S, 3], metres, of recorded joints of
+            the trunk from where parts of the standard shape and the person's size have them, part axes. lengths: [J], metres, of the person's
+            bones. known: [J], whether the set has the joint.
     """
 
     origin: str
@@ -102,7 +102,7 @@ class MotionSequence(NamedTuple):
 class Mirror(NamedTuple):
     """Holds which column [R] of rotations the mirror image has in place of each, and its sign [R]."""
 
-    index: Tensor
+    columns: Tensor
     sign: Tensor
 
 
@@ -112,13 +112,11 @@ def mirror_of(articulation: Articulation) -> Mirror:
     In a mirror across x, rotation vectors (x, y, z) become (x, -y, -z), of the part on the other side.
     """
     parts = articulation.skeleton.parts
-    places = list(
-        zip(articulation.axis_part.tolist(), articulation.axis.tolist(), strict=True)
-    )
+    places = list(zip(articulation.axis_part.tolist(), articulation.axis.tolist(), strict=True))
     other = [(parts.index(other_side(parts[p])), a) for p, a in places]
     sign = [1.0 if a == 0 else -1.0 for _, a in places]
-    index = torch.tensor([places.index(place) for place in other])
-    return Mirror(index, torch.tensor(sign, dtype=torch.float64))
+    columns = torch.tensor([places.index(place) for place in other])
+    return Mirror(columns, torch.tensor(sign, dtype=torch.float64))
 
 
 def motion_sequence(
@@ -148,7 +146,9 @@ def motion_sequence(
     parents = [articulation.skeleton.parents[j] for j in shifted]
     carried = articulation.world_rotations(point)[:, articulation.part_of[shifted]]
     bones = (joints[:, shifted] - joints[:, parents]).to(states)
-    residual = (carried.mT @ bones[..., None]).squeeze(-1) - body.offsets[shifted]
+    standard = nn.functional.normalize(articulation.offsets[shifted], dim=-1)
+    rigid = body.bone_lengths[shifted, None] * standard
+    residual = (carried.mT @ bones[..., None]).squeeze(-1) - rigid
     known = joints.isfinite().all(-1).all(0)
     origin = person.partition("#")[0]
     return MotionSequence(origin, person, fps, point, residual, body.bone_lengths, known)
@@ -283,14 +283,15 @@ def _without_last(value: Tensor) -> Tensor:
 
 def _decay(articulation: Articulation, sequences: Sequence[MotionSequence]) -> Float[Tensor, " V"]:
     velocities = _clipped([_velocities(articulation, s) for s in sequences])
-    near, far, between, count = 0.0, 0.0, 0.0, 0
+    near, far = torch.zeros_like(velocities[0][0]), torch.zeros_like(velocities[0][0])
+    between, count = 0.0, 0
     for sequence, v in zip(sequences, velocities, strict=True):
         first, second = _lags(sequence.fps)
         n = len(v) - second
         near = near + (v[:n] * v[first : first + n]).sum(0)
         far = far + (v[:n] * v[second:]).sum(0)
         between, count = between + n * (second - first) / sequence.fps, count + n
-    ratio = torch.as_tensor(far).clamp_min(0) / torch.as_tensor(near).clamp_min(1e-12)
+    ratio = far.clamp_min(0) / near.clamp_min(1e-12)
     return (-ratio.clamp(1e-12, 1.0).log() * (count / between)).clamp(*_DECAYS)
 
 
@@ -324,7 +325,7 @@ def _geometric_mean(values: Float[Tensor, "K V"], told: Bool[Tensor, "K V"]) -> 
 def _alike(articulation: Articulation, values: Float[Tensor, " V"]) -> Tensor:
     """Return values that are the same in all directions and on both sides."""
     position, angles = values[:3].mean().expand(3), values[3:]
-    return torch.cat([position, (angles * angles[mirror_of(articulation).index]).sqrt()])
+    return torch.cat([position, (angles * angles[mirror_of(articulation).columns]).sqrt()])
 
 
 # --- shifts ---------------------------------------------------------------------------------------
@@ -333,7 +334,7 @@ def _alike(articulation: Articulation, values: Float[Tensor, " V"]) -> Tensor:
 def _fit_shifts(
     articulation: Articulation, sets: _Sets, least: float
 ) -> tuple[Float[Tensor, " S"], Float[Tensor, "1"]]:
-    """Return the standard deviation of joints from rigid parts, along each axis, and their correlation time."""
+    """Return the deviation of joints from rigid parts, along each axis, and its correlation time."""
     variances, later, told = [], [], []
     for own in sets.values():
         residuals = [r.flatten(1) for r in _clipped([s.residual.flatten(1) for s in own])]
@@ -376,8 +377,8 @@ def _time(variance: float, product: float) -> Float[Tensor, "1"]:
 def _fit_scales(articulation: Articulation, sets: _Sets) -> tuple[Tensor, Tensor]:
     """Return mean [G] and covariance [G, G] of logarithms of bone lengths over the standard ones.
 
-    The covariance is that of persons within a set plus that of the sets, which define joints differently. Where
-    persons or sets are few, the usual spread counts more.
+    The covariance is that of persons within a set plus that of the sets, which define joints differently.
+    Where persons or sets are few, the usual spread counts more.
     """
     scales = [_scales_of_set(articulation, own) for own in sets.values()]
     means = torch.stack([own.nanmean(0) for own in scales])
@@ -437,7 +438,7 @@ def _fit_poses(
     drawn = _draw_poses(articulation, sets, recipe.n_samples, generator)
     mirror = mirror_of(articulation)
     root = int((articulation.axis_part == 0).sum())
-    index, sign = mirror.index[root:] - root, mirror.sign[root:]
+    index, sign = mirror.columns[root:] - root, mirror.sign[root:]
     half = GaussianMixture.fit(
         drawn,
         n_components=recipe.n_components // 2,

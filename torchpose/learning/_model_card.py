@@ -316,7 +316,13 @@ def _limbs(limbs: Any) -> _Told:
         "It knows how these persons moved in these actions; limbs in other positions or faster ones are "
         "followed late or not at all."
     )
-    return what, rows, held_out, _tracking(f"--method root --conditionals {_call(info.name)}"), limits
+    return (
+        what,
+        rows,
+        held_out,
+        _tracking(f"--method root --conditionals {_call(info.name)}"),
+        limits,
+    )
 
 
 def _action(space: Any) -> _Told:
@@ -328,7 +334,13 @@ def _action(space: Any) -> _Told:
     held_out = _gates({info.name: accepted} if accepted is not None else {})
     rows = {"performances": info.performances, "frame rate": _rate(info.fps)}
     limits = "Somebody who does anything else is held in the postures of this action."
-    return what, rows, held_out, _tracking(f"--method constrained --action {_call(info.name)}"), limits
+    return (
+        what,
+        rows,
+        held_out,
+        _tracking(f"--method constrained --action {_call(info.name)}"),
+        limits,
+    )
 
 
 def _bank(bank: Any) -> _Told:
@@ -353,16 +365,18 @@ def _body_motion(motion: Any) -> _Told:
     what = (
         "How fast position and angles of a body accelerate and how their velocities decay "
         "(Ornstein-Uhlenbeck processes), how far neck, shoulders and hips shift from rigid parts, mean and "
-        f"covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians over the angles "
-        "of all parts, half of them mirror images of the others. The Kalman filter over bodies from keypoints "
-        "uses it. Every set of recordings counts alike, except that poses have shares as the roots of durations."
+        f"covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians over the "
+        "angles of all parts, half of them mirror images of the others. The Kalman filter over bodies from "
+        "keypoints uses it. Every set of recordings counts alike, except that poses have shares as the roots "
+        "of durations."
     )
     held_out = ""
     if found:
         held_out = (
-            f"Persons who were held out ({found['frames']:,} frames) accelerate {found['acceleration']:.2f} "
-            f"times as much as the prior has it. The log density of their poses is {found['log_density']:.2f} "
-            f"an angle, that of the persons above {found['fitted_log_density']:.2f}."
+            f"Persons who were held out ({found['frames']:,} frames) accelerate "
+            f"{found['acceleration']:.2f} times as much as the prior has it. The log density of their poses "
+            f"is {found['log_density']:.2f} an angle, that of the persons above "
+            f"{found['fitted_log_density']:.2f}."
         )
     rows = {
         "frames": f"{info.n_frames:,}",
@@ -370,8 +384,8 @@ def _body_motion(motion: Any) -> _Told:
         "settings": ", ".join(f"{key} {value:g}" for key, value in sorted(settings.items())),
     }
     limits = (
-        "It knows how these persons moved and what they did. Faster motion is followed late, and poses unlike "
-        "theirs are taken for others where cameras see little."
+        "It knows how these persons moved and what they did. Faster motion is followed late, and poses "
+        "unlike theirs are taken for others where cameras see little."
     )
     use = f"```python\nmotion = torchpose.load_body_motion({(info.name or 'FILE')!r})\n```"
     return what, rows, held_out, use, limits

@@ -75,9 +75,9 @@ class BodyMotion(nn.Module):
       over persons.
 
     Args:
-        acceleration: [3 + R], m or rad per s^1.5. decay: [3 + R], 1/s. shift_std: [S], metres, along each axis.
-        shift_time, pull_time: seconds.
-        scale_mean: [G]. scale_cov: [G, G]. poses: mixture over the Q relative angles of `Articulation`, radians.
+        acceleration: [3 + R], m or rad per s^1.5. decay: [3 + R], 1/s.
+        shift_std: [S], metres, along each axis. shift_time, pull_time: seconds.
+        scale_mean: [G]. scale_cov: [G, G]. poses: mixture over the Q `relative_angles` of `Articulation`.
         info: facts about the fit. articulation: of the bodies.
 
     Raises:
@@ -130,7 +130,8 @@ class BodyMotion(nn.Module):
     def pull(self, angles: Float[Tensor, "*batch Q"], cov: Float[Tensor, "*batch Q Q"]) -> PosePull:
         """Return the slope and curvature of the log density of poses, expected over its components.
 
-        sum_k r_k Sigma_k^-1 (mu_k - theta)   and   sum_k r_k Sigma_k^-1,   r_k ~ pi_k N(theta; mu_k, Sigma_k + P)
+        sum_k r_k Sigma_k^-1 (mu_k - theta)   and   sum_k r_k Sigma_k^-1,
+        r_k ~ pi_k N(theta; mu_k, Sigma_k + P)
 
         Args:
             angles: theta, radians. cov: P, of the angles.
@@ -171,4 +172,4 @@ class BodyMotion(nn.Module):
         info, tensors = read_tensors(path, _KIND)
         given = {name: value.double() for name, value in tensors.items()}
         poses = GaussianMixture(*(given.pop(n) for n in ("weights", "means", "covariances")))
-        return cls(**given, poses=poses, info=info)
+        return cls(**given, poses=poses, info=info)  # type: ignore[arg-type]

@@ -42,8 +42,8 @@ class RecordedMotion:
     """Holds the motion of all persons on the articulation that is tracked.
 
     Attributes:
-        fps: most frames per second of the sequences. train, watched: of each recording, `watched` those of persons
-            who are held out. fitted, held_out: the recordings.
+        fps: most frames per second of the sequences. train, watched: of each recording, `watched` those of
+            persons who are held out. fitted, held_out: the recordings.
     """
 
     fps: float
@@ -90,7 +90,9 @@ class RecordedMotion:
         }
         found = []
         every = zip(both, joints, rates, strict=True)
-        for recording, points, rate in tqdm(every, total=len(both), disable=not progress, unit="recording"):
+        for recording, points, rate in tqdm(
+            every, total=len(both), disable=not progress, unit="recording"
+        ):
             body = bodies[recording.person_id]
             states = state_of(body, recording, points)
             found.append(
@@ -111,8 +113,8 @@ class MotionSpread(NamedTuple):
     """Holds how held-out persons move and stand, relative to the persons fitted to.
 
     Attributes:
-        acceleration: of theirs, in deviations of the prior. log_density, fitted_log_density: mean of their poses
-            and of those fitted to, per angle. frames: how many there were.
+        acceleration: of theirs, in deviations of the prior. log_density, fitted_log_density: mean of their
+            poses and of those fitted to, per angle. frames: how many there were.
     """
 
     acceleration: float
