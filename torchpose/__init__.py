@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from torchpose.errors import TorchposeError as TorchposeError
     from torchpose.priors._gaussian_mixture import GaussianMixture as GaussianMixture
     from torchpose.priors._shipped import load_action as load_action
-    from torchpose.priors._shipped import load_body_motion as load_body_motion
     from torchpose.priors._shipped import load_limb_conditionals as load_limb_conditionals
     from torchpose.priors._shipped import load_manifold as load_manifold
     from torchpose.priors._upper_body_prior import UpperBodyPrior as UpperBodyPrior
@@ -78,7 +77,6 @@ _HOMES = {
     "UpperBodyTracker": "upper_body._upper_body_tracker",
     "VideoTracker": "video._video_tracker",
     "load_action": "priors._shipped",
-    "load_body_motion": "priors._shipped",
     "load_limb_conditionals": "priors._shipped",
     "load_manifold": "priors._shipped",
     "load_prior": "priors._upper_body_prior",
@@ -96,7 +94,6 @@ __all__ = [
     "UpperBodyTracker",
     "VideoTracker",
     "load_action",
-    "load_body_motion",
     "load_limb_conditionals",
     "load_manifold",
     "load_prior",

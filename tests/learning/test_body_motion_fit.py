@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.body.test_articulation import zero_point
+from torchpose.body import fit_body, fit_state
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.errors import InputError
 from torchpose.learning._body_motion_fit import (
@@ -14,8 +15,10 @@ from torchpose.learning._body_motion_fit import (
     acceleration_ratio,
     fit_body_motion,
     mirror_of,
+    motion_sequence,
     pose_log_density,
 )
+from torchpose.math._rotations import matrix_to_quaternion_vector
 
 QUICK = BodyMotionRecipe(n_components=4, n_samples=400, acceleration_scale=1.0)
 ACCELERATION, DECAY = 2.0, 4.0
@@ -79,6 +82,28 @@ def without(sequence: MotionSequence, articulation: Articulation, *names: str) -
     known = sequence.known.clone()
     known[[articulation.skeleton.joint(name) for name in names]] = False
     return sequence._replace(known=known)
+
+
+def test_recorded_joints_are_those_of_the_motion(articulation):
+    """Hips sit lower than on the standard body, and the neck moves."""
+    truth = walk(articulation, frames=40).point
+    shifts = torch.zeros_like(truth.shifts)
+    names = [articulation.skeleton.names[j] for j in articulation.shifted]
+    shifts[:, [names.index("left_hip"), names.index("right_hip")], 1] = -0.05
+    shifts[:, names.index("neck"), 2] = 0.01 * torch.linspace(0, 6, 41).double().sin()
+    joints = articulation.joints(truth._replace(shifts=shifts))
+    joints[:, articulation.skeleton.joint("head")] = torch.nan
+    centres = matrix_to_quaternion_vector(articulation.centres)
+    body = fit_body(joints, centres=centres)
+    found = motion_sequence(articulation, body, fit_state(body, joints), joints, FPS, "a#1")
+    assert (found.origin, found.person, found.fps) == ("a", "a#1", FPS)
+    assert found.known.tolist() == [name != "head" for name in articulation.skeleton.names]
+    point = found.point._replace(scales=found.point.scales + articulation.scales_of(found.lengths))
+    again = articulation.joints(point._replace(shifts=found.residual))
+    told = found.known & (articulation.part_of < 2)
+    root = joints[:, :1] - again[:, :1]
+    torch.testing.assert_close(again[:, told] + root, joints[:, told], atol=1e-4, rtol=0)
+    assert 0.01 < float(found.residual.square().mean().sqrt()) < 0.03
 
 
 @pytest.mark.parametrize("fps", [FPS, 15.0])

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from tests.priors.mixtures import random_mixture
-from torchpose import load_body_motion
 from torchpose.body._articulation import Articulation
 from torchpose.errors import FileFormatError, PriorError, ShapeError
 from torchpose.priors import GaussianMixture
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
+from torchpose.priors._shipped import load_body_motion
 
 
 def some_motion(**changed) -> BodyMotion:

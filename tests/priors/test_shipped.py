@@ -8,13 +8,13 @@ import torch
 import yaml
 
 from tests.data import data_dir_or_skip
-from torchpose import load_action, load_body_motion, load_limb_conditionals, load_manifold
+from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
 from torchpose.cli._fit_bodies import command
 from torchpose.errors import OverlapError, PriorError
 from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models
-from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, refuse_seen
+from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, load_body_motion, refuse_seen
 
 ROOT = Path(__file__).parents[2]
 LOADERS = {
@@ -31,6 +31,7 @@ FITTED_BY = {
 }
 SHIPPED = [(kind, name) for kind in KINDS for name in known_models(kind)]
 RESULTS = "## On persons that it was not fitted on\n\n"
+CHOSEN = "## How its settings were chosen\n\n"
 
 
 def settings_of(info):
@@ -49,8 +50,8 @@ def test_its_card_says_what_its_file_says(kind, name):
     info = model.info
     assert info.name == name and info.licence and info.sources
     card = (WEIGHTS / kind / f"{name}.md").read_text(encoding="utf-8")
-    results = card.partition(RESULTS)[2].partition("\n\n## ")[0]
-    assert card == body_card(model, results=results)
+    results, chosen = (card.partition(title)[2].partition("\n\n## ")[0] for title in (RESULTS, CHOSEN))
+    assert card == body_card(model, results=results, chosen=chosen)
     if kind != "bodies":
         assert results and "torchpose evaluate" in results
     for person in info.persons:

@@ -86,8 +86,8 @@ class MotionSequence(NamedTuple):
     Attributes:
         origin: the set that the recording is of. person: its id. fps: frames per second.
         point: [T], on the manifold of the articulation. residual: [T, S, 3], metres, of recorded joints of
-            the trunk from where parts of the standard shape and the person's size have them, part axes. lengths: [J], metres, of the person's
-            bones. known: [J], whether the set has the joint.
+            the trunk from where parts of the standard shape and the person's lengths have them, part axes.
+            lengths: [J], metres, of the person's bones. known: [J], whether the set has the joint.
     """
 
     origin: str

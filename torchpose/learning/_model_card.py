@@ -245,13 +245,14 @@ _LIMITS = (
 )
 
 
-def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
+def body_card(model: BodyModel, name: str = "", results: str = "", chosen: str = "") -> str:
     """Return Markdown text on what a model is, what it was fitted to, and what it is not good for.
 
     Args:
         model: a manifold, limb conditionals, an action space or bank, or a prior over the motion of bodies.
         name: of the model, where its file does not say. results: what it scored on persons whom it was
             not fitted on, as Markdown.
+        chosen: how settings were chosen, as Markdown.
     """
     describe = next(text for kind, text in _DESCRIBED.items() if isinstance(model, kind))
     what, rows, held_out, use, limits = describe(model)
@@ -259,6 +260,7 @@ def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
         "What it is": what,
         "Fitted on": card_table({**_body_data(model.info), **rows}),
         "Held out while it was fitted": held_out,
+        "How its settings were chosen": chosen,
         "On persons that it was not fitted on": results,
         "Use": use,
         "Limits": f"{limits} {_LIMITS}",
@@ -387,7 +389,7 @@ def _body_motion(motion: Any) -> _Told:
         "It knows how these persons moved and what they did. Faster motion is followed late, and poses "
         "unlike theirs are taken for others where cameras see little."
     )
-    use = f"```python\nmotion = torchpose.load_body_motion({(info.name or 'FILE')!r})\n```"
+    use = '`BodyTracker(..., method="kalman")` uses the one that comes with the package, "whole-body".'
     return what, rows, held_out, use, limits
 
 

@@ -11,7 +11,6 @@ from torchpose.priors._manifold.manifold_file import ManifoldInfo
 from torchpose.priors._shipped import (
     known_models,
     load_action,
-    load_body_motion,
     load_limb_conditionals,
     load_manifold,
 )
@@ -29,7 +28,6 @@ __all__ = [
     "known_models",
     "known_priors",
     "load_action",
-    "load_body_motion",
     "load_limb_conditionals",
     "load_manifold",
     "load_prior",
