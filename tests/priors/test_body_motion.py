@@ -4,32 +4,16 @@ import pytest
 import torch
 
 from tests.priors.mixtures import random_mixture
-from torchpose.body._articulation import Articulation
+from tests.priors.motions import some_body_motion
 from torchpose.errors import FileFormatError, PriorError, ShapeError
 from torchpose.priors import GaussianMixture
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
 from torchpose.priors._shipped import load_body_motion
 
 
-def some_motion(**changed) -> BodyMotion:
-    body = Articulation()
-    n_angles = body.relative_columns.stop - body.relative_columns.start
-    given = {
-        "acceleration": torch.full((body.n_pose,), 3.0).double(),
-        "decay": torch.full((body.n_pose,), 4.0).double(),
-        "shift_std": torch.full((len(body.shifted),), 0.02).double(),
-        "shift_time": torch.tensor([0.5]).double(),
-        "pull_time": torch.tensor([1.0]).double(),
-        "scale_mean": torch.zeros(len(body.groups)).double(),
-        "scale_cov": 0.01 * torch.eye(len(body.groups)).double(),
-        "poses": random_mixture(3, n_angles),
-    }
-    return BodyMotion(**(given | changed))
-
-
 def test_a_file_brings_it_back(tmp_path):
     info = BodyMotionInfo("mine", ("a#1",), ("walk",), ("a",), "CC0", "made", 30.0, 7, {"x": 1})
-    one = some_motion(info=info)
+    one = some_body_motion(info=info)
     path = tmp_path / "body.safetensors"
     one.save(path)
     for two in (BodyMotion.load(path), load_body_motion(path)):
@@ -63,13 +47,13 @@ def test_the_shipped_one_is_of_the_body_that_is_tracked():
 )
 def test_what_does_not_fit_is_refused(changed, error, said):
     with pytest.raises(error, match=said):
-        some_motion(**changed)
+        some_body_motion(**changed)
 
 
 def test_a_single_gaussian_pulls_by_its_information():
     g = torch.Generator().manual_seed(0)
     poses = random_mixture(1, 21)
-    motion = some_motion(poses=GaussianMixture(*poses.parameters_tuple()))
+    motion = some_body_motion(poses=GaussianMixture(*poses.parameters_tuple()))
     angles = torch.randn(5, 21, generator=g, dtype=torch.float64)
     pull = motion.pull(angles, 0.1 * torch.eye(21).double().expand(5, 21, 21))
     information = torch.linalg.inv(poses.covariances[0])

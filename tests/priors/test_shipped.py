@@ -50,7 +50,9 @@ def test_its_card_says_what_its_file_says(kind, name):
     info = model.info
     assert info.name == name and info.licence and info.sources
     card = (WEIGHTS / kind / f"{name}.md").read_text(encoding="utf-8")
-    results, chosen = (card.partition(title)[2].partition("\n\n## ")[0] for title in (RESULTS, CHOSEN))
+    results, chosen = (
+        card.partition(title)[2].partition("\n\n## ")[0] for title in (RESULTS, CHOSEN)
+    )
     assert card == body_card(model, results=results, chosen=chosen)
     if kind != "bodies":
         assert results and "torchpose evaluate" in results

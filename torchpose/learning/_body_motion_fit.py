@@ -61,9 +61,9 @@ class BodyMotionRecipe:
         seed: of the drawn poses and of the mixture's start.
     """
 
-    n_components: int = 24
+    n_components: int = 16
     n_samples: int = 12000
-    covariance_floor: float = 9e-4
+    covariance_floor: float = 0.06
     acceleration_scale: float = 1.25
     least_shift: float = 0.01
     pull_time: float = 1.0
