@@ -1,4 +1,4 @@
-"""`torchpose fit manifold|limbs|actions`: the files of the training loop, without Lightning; going on."""
+"""`torchpose fit manifold|limbs|actions|body`: files of the training loop, without Lightning; going on."""
 
 import os
 import subprocess
@@ -17,24 +17,29 @@ from torchpose.cli._fit_bodies import KINDS, command, recorded_command
 from torchpose.learning._gplvm_fit import GPLVMFit
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
 from torchpose.priors._actions.postures import posture_angles, posture_to_state
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 
 LOADERS = {
     "manifold": BackConstrainedGPLVM.load,
     "limbs": LimbConditionals.load,
     "actions": ActionBank.load,
+    "body": BodyMotion.load,
 }
 QUICK = {
     "manifold": ("--frames", 60, "--steps", 3, "--start", 1, "--validation", 1),
     "limbs": ("--least-std", 0.02),
     "actions": ("--actions", "action1", "action0", "--n-dimensions", 5, "--gate-dimensions", 3),
+    "body": ("--n-components", 4, "--n-samples", 200, "--acceleration-scale", 2),
 }
+DRAWN = ("manifold", "actions")
 TRAINED = {
     "manifold": {"data.frames": 60, "data.validation": 1, "model.steps": 3, "model.start": 1},
     "limbs": {"model.least_std": 0.02},
     "actions": {
         "data.actions": "[action1,action0]", "model.n_dimensions": 5, "model.gate_dimensions": 3,
     },
+    "body": {"model.n_components": 4, "model.n_samples": 200, "model.acceleration_scale": 2.0},
 }  # fmt: skip
 
 
@@ -96,7 +101,7 @@ def test_it_is_the_file_of_the_training_loop(kind, torchpose, walks, exercises, 
     held_out = () if kind == "manifold" else ("--held-out", "p2")
     out = tmp_path / "mine.safetensors"
     done = torchpose("fit", kind, folder, "--out", out, *QUICK[kind], *held_out,
-                     "--licence", "CC0", *(("--pictures", "false") if kind != "limbs" else ()))  # fmt: skip
+                     "--licence", "CC0", *(("--pictures", "false") if kind in DRAWN else ()))  # fmt: skip
     assert done.code == 0, done.err
     assert "mine.safetensors" in done.out and "mine.md" in done.out
     runs = str(tmp_path / "runs")
@@ -104,7 +109,7 @@ def test_it_is_the_file_of_the_training_loop(kind, torchpose, walks, exercises, 
              "data.without": "null", **TRAINED[kind]}  # fmt: skip
     if held_out:
         given["data.held_out"] = "[p2]"
-    if kind != "limbs":
+    if kind in DRAWN:
         given["model.picture"] = "false"
     options = [
         text for key, value in given.items()
@@ -188,6 +193,28 @@ def test_one_action_is_a_space(torchpose, exercises, tmp_path):
     assert out.with_suffix(".md").read_text().startswith("# action0")
 
 
+def test_the_motion_of_bodies_says_how_others_move(torchpose, walks, tmp_path):
+    out = tmp_path / "body.safetensors"
+    done = torchpose("fit", "body", walks, "--out", out, *QUICK["body"], "--held-out", "p2")
+    assert done.code == 0, done.err
+    assert "motion of 27 columns and 4 kinds of poses from" in done.out
+    info = BodyMotion.load(out).info
+    assert info.persons == ("set#p0", "set#p1") and info.actions == ("walk",) and info.fps == 30.0
+    assert info.extra["settings"]["acceleration_scale"] == 2
+    told = info.extra["held_out"]
+    assert told["frames"] == 60 and 0.3 < told["acceleration"] < 0.7
+    card = out.with_suffix(".md").read_text()
+    assert card.startswith("# body\n") and "2: p0, p1" in card and "acceleration_scale 2" in card
+    said = torchpose("info", out).out
+    for part in (
+        "left_shank about x: ",
+        "4 components over 21 angles",
+        "accelerating 0.",
+        "2: set#p0",
+    ):
+        assert part in said
+
+
 def test_a_configuration_names_the_command(torchpose, walks, tmp_path):
     config = tmp_path / "limbs.yaml"
     printed = torchpose(
@@ -229,6 +256,9 @@ def test_lightning_is_not_imported(walks, tmp_path):
         (("actions", "{walks}"), "--actions"),
         (("actions", "{walks}", "--actions", "walk", "--postures", "arms"), "body or joints"),
         (("actions",), "missing: DIR"),
+        (("body", "{walks}", "--n-components", 3), "n_components must be even"),
+        (("body", "{walks}", "--fps", 0), "fps must be positive"),
+        (("body", "{walks}", "--fps", 1), "add longer ones"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(torchpose, walks, tmp_path, line, said):

@@ -15,6 +15,7 @@ from benchmarks.humaneva_files import read_calibration, read_stream_offset
 from torchpose.camera import CameraRig, load_cameras
 from torchpose.io import read_keypoints, read_recording
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, UpperBodyPrior
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
@@ -211,7 +212,8 @@ def _prior(path: Path) -> None:
 
 
 def _models(path: Path) -> None:
-    kinds = {"manifold": BackConstrainedGPLVM, "limbs": LimbConditionals, "space": ActionSpace}
+    kinds = {"manifold": BackConstrainedGPLVM, "limbs": LimbConditionals, "space": ActionSpace,
+             "body": BodyMotion}  # fmt: skip
     load = kinds.get(path.stem, ActionBank)
     model = load.load(path)
     unknown = ("std_latent", "std_pose", "std_step") if load is BackConstrainedGPLVM else ()
@@ -220,6 +222,8 @@ def _models(path: Path) -> None:
     for name, tensor in model.named_buffers():
         if name in ("std", "match_std", "residual_std", "background_std", "gamma_x", "scale"):
             _need(bool((tensor >= 0).all()), f"{name} is negative")
+        if name in ("acceleration", "decay", "shift_std", "shift_time", "pull_time"):
+            _need(bool((tensor > 0).all()), f"{name} is not positive")
         if name in ("covariance", "diffusion"):
             _covariance(name, tensor, torch.ones(len(tensor), dtype=torch.bool))
 

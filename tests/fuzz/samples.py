@@ -21,7 +21,7 @@ from tests.io.skeleton_files import (
     to_kinect,
 )
 from tests.priors.mixtures import random_mixture
-from tests.priors.motions import motion
+from tests.priors.motions import motion, some_body_motion
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body, centres_of
 from torchpose.camera import PinholeCamera, save_cameras
@@ -285,6 +285,7 @@ SAMPLES: dict[str, dict[str, Callable[[Path], Content]]] = {
         "manifold.safetensors": _saved(_manifold, "manifold.safetensors"),
         "limbs.safetensors": _saved(_limbs, "limbs.safetensors"),
         "space.safetensors": _saved(lambda p: _spaces()[0].save(p), "space.safetensors"),
+        "body.safetensors": _saved(lambda p: some_body_motion().save(p), "body.safetensors"),
         "bank.safetensors": _saved(lambda p: ActionBank(_spaces()).save(p), "bank.safetensors"),
     },
     "video": {"a.mp4": _video},

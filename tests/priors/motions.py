@@ -1,9 +1,13 @@
-"""Cyclic motions of 30 columns, as smooth as walking, and with noise of a known size."""
+"""Cyclic motions of 30 columns, as smooth as walking, with noise of a known size; a prior over motion."""
 
 import math
 
 import torch
 from torch import Tensor
+
+from tests.priors.mixtures import random_mixture
+from torchpose.body._articulation import Articulation
+from torchpose.priors._body_motion import BodyMotion
 
 CYCLE, NOISE = 66, 0.01  # frames of a cycle at 60 Hz; standard deviation of each column
 
@@ -21,3 +25,20 @@ def motion(
     generator = torch.Generator().manual_seed(100 + seed)
     shaken = torch.randn(frames, 30, generator=generator, dtype=torch.float64)
     return rest + torch.stack(waves, 1) @ weights + noise * shaken
+
+
+def some_body_motion(**changed) -> BodyMotion:
+    """A prior over the motion of bodies, of which some arguments are others."""
+    body = Articulation()
+    n_angles = body.relative_columns.stop - body.relative_columns.start
+    given = {
+        "acceleration": torch.full((body.n_pose,), 3.0).double(),
+        "decay": torch.full((body.n_pose,), 4.0).double(),
+        "shift_std": torch.full((len(body.shifted),), 0.02).double(),
+        "shift_time": torch.tensor([0.5]).double(),
+        "pull_time": torch.tensor([1.0]).double(),
+        "scale_mean": torch.zeros(len(body.groups)).double(),
+        "scale_cov": 0.01 * torch.eye(len(body.groups)).double(),
+        "poses": random_mixture(3, n_angles),
+    }
+    return BodyMotion(**(given | changed))

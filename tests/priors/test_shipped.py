@@ -14,17 +14,24 @@ from torchpose.cli._fit_bodies import command
 from torchpose.errors import OverlapError, PriorError
 from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models
-from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, refuse_seen
+from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, load_body_motion, refuse_seen
 
 ROOT = Path(__file__).parents[2]
 LOADERS = {
     "manifolds": load_manifold,
     "conditionals": load_limb_conditionals,
     "actions": load_action,
+    "bodies": load_body_motion,
 }
-FITTED_BY = {"manifolds": "manifold", "conditionals": "limbs", "actions": "actions"}
+FITTED_BY = {
+    "manifolds": "manifold",
+    "conditionals": "limbs",
+    "actions": "actions",
+    "bodies": "body",
+}
 SHIPPED = [(kind, name) for kind in KINDS for name in known_models(kind)]
 RESULTS = "## On persons that it was not fitted on\n\n"
+CHOSEN = "## How its settings were chosen\n\n"
 
 
 def settings_of(info):
@@ -43,9 +50,12 @@ def test_its_card_says_what_its_file_says(kind, name):
     info = model.info
     assert info.name == name and info.licence and info.sources
     card = (WEIGHTS / kind / f"{name}.md").read_text(encoding="utf-8")
-    results = card.partition(RESULTS)[2].partition("\n\n## ")[0]
-    assert card == body_card(model, results=results)
-    assert results and "torchpose evaluate" in results
+    results, chosen = (
+        card.partition(title)[2].partition("\n\n## ")[0] for title in (RESULTS, CHOSEN)
+    )
+    assert card == body_card(model, results=results, chosen=chosen)
+    if kind != "bodies":
+        assert results and "torchpose evaluate" in results
     for person in info.persons:
         assert person.partition("#")[2] in card
 

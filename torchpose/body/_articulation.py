@@ -13,7 +13,7 @@ Pelvis and torso have three axes. Limbs and head have the two across their bone:
 which is zero about the part's centre (`Body`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,7 +24,6 @@ from torch import Tensor, nn
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.math._rotations import (
-    compose,
     matrix_to_quaternion_vector,
     minimal_rotation,
     quaternion_vector_to_matrix,
@@ -52,8 +51,8 @@ class BodyPoint(NamedTuple):
     """Holds points on the manifold of body states.
 
     Attributes:
-        position: [..., 3], metres. rotations: [..., P, 3, 3], the root's to world axes, the others' relative to
-            their centre and the part above. velocity: [..., 3 + R]. scales: [..., G]. shifts: [..., S, 3].
+        position: [..., 3], metres. rotations: [..., P, 3, 3], the root's to world axes, the others' relative
+            to their centre and the part above. velocity: [..., 3 + R]. scales: [..., G]. shifts: [..., S, 3].
     """
 
     position: Tensor
@@ -62,7 +61,7 @@ class BodyPoint(NamedTuple):
     scales: Tensor
     shifts: Tensor
 
-    def map(self, change) -> "BodyPoint":  # noqa: ANN001
+    def map(self, change: Callable[[Tensor], Tensor]) -> "BodyPoint":
         """Return the point with a function applied to every tensor."""
         return BodyPoint(*(change(value) for value in self))
 
@@ -82,6 +81,18 @@ class Articulation(nn.Module):
         skeleton: of the body.
         dtype: of buffers.
     """
+
+    offsets: Tensor
+    path: Tensor
+    group: Tensor
+    part_of: Tensor
+    axis_part: Tensor
+    axis: Tensor
+    pivot: Tensor
+    moves: Tensor
+    centres: Tensor
+    carriers: Tensor
+    in_group: Tensor
 
     def __init__(
         self,
@@ -148,13 +159,19 @@ class Articulation(nn.Module):
         return slice(rotations.start + root, rotations.stop)
 
     def relative_angles(self, point: BodyPoint) -> Float[Tensor, "*batch Q"]:
-        """Return the rotation vectors of all parts but the root about their centres, on their axes, radians."""
+        """Return rotation vectors of all parts but the root about their centres, on their axes, radians."""
         turns = _rotation_vectors(point.rotations)
         root = int((self.axis_part == 0).sum())
         return turns[..., self.axis_part[root:], self.axis[root:]]
 
+    def scales_of(self, lengths: Float[Tensor, "*batch J"]) -> Float[Tensor, "*batch G"]:
+        """Return the logarithms of bone lengths over the standard ones, both sides averaged."""
+        logs = (lengths[..., 1:] / self.offsets[1:].norm(dim=-1)).log()
+        members = self.in_group[1:]
+        return (logs @ members) / members.sum(0)
+
     def _carriers(self) -> Float[Tensor, "J N"]:
-        """Return which columns directly move a joint: the angles and shift of its bone, and their velocity."""
+        """Return which columns directly move a joint: angles and shift of its bone, and their velocity."""
         n, at = len(self.skeleton.names), self.columns
         carriers = torch.zeros(n, self.dim)
         turned = (self.part_of[:, None] == self.axis_part).float()

@@ -25,7 +25,8 @@ torchpose fit room/ --out prior.safetensors --axes z-up --harmonise true
 torchpose fit recordings/ --out renewed.safetensors --noise-of prior.safetensors
 torchpose fit manifold --help
 torchpose fit limbs --help
-torchpose fit actions --help"""
+torchpose fit actions --help
+torchpose fit body --help"""
 
 _SHOWN_DROPS = 5
 _KEYS = {"n_components": "components", "calibration_folds": "folds"}
@@ -80,8 +81,8 @@ def run(
     """Fit a prior of the upper body to recorded 3D poses seen from random viewpoints.
 
     From persons held out in turn it learns how good the prior is on somebody new. Writes the prior, a model
-    card beside it (.md) and a picture of its mean poses (.png). With the word manifold, limbs or actions
-    before the recordings, what the trackers of whole bodies learn; see their own --help.
+    card beside it (.md) and a picture of its mean poses (.png). With the word manifold, limbs, actions or
+    body before the recordings, what the trackers of whole bodies learn; see their own --help.
 
     Args:
         recordings: folders (with their subfolders) or files; a folder is a person where a file does not

@@ -1,4 +1,4 @@
-"""`torchpose fit manifold|limbs|actions`: what the body trackers learn, from recordings of whole bodies."""
+"""`torchpose fit manifold|limbs|actions|body`: what body trackers learn from recordings of whole bodies."""
 
 import shlex
 from collections.abc import Callable, Iterator
@@ -24,6 +24,8 @@ _EXAMPLES = {
     "torchpose fit limbs recordings/ --out bends.safetensors --actions bend --fps 30",
     "actions": "torchpose fit actions recordings/ --actions bend --out bend.safetensors --held-out carl\n"
     "torchpose fit actions recordings/ --actions bend wave clap --out bank.safetensors",
+    "body": "torchpose fit body recordings/ --out body.safetensors --held-out carl\n"
+    "torchpose fit body walks/ exercises/ --out body.safetensors --acceleration-scale 1.5",
 }
 KINDS = tuple(_EXAMPLES)
 """What there is to fit, beside priors of the upper body."""
@@ -234,4 +236,48 @@ def fit_actions(
     return 0
 
 
-_FITS = {"manifold": _manifold, "limbs": _limbs, "actions": _actions}
+# --- how bodies move ------------------------------------------------------------------------------
+
+
+def _body() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+    from torchpose.learning._body_motion_fit import BodyMotionRecipe
+    from torchpose.learning._recipes.body_motion import RecordedMotion
+
+    return fit_body_motion, _gathered(RecordedMotion.gather), options_of(BodyMotionRecipe)
+
+
+def fit_body_motion(
+    recordings: list[str],
+    *,
+    out: str,
+    choice: dict[str, Any],
+    recipe: dict[str, Any],
+    name: str = "",
+    licence: str = "",
+    given: Given,
+) -> int:
+    """Fit how bodies move, which poses they take and how they are built.
+
+    It is for the filter that tracks whole bodies from keypoints.
+
+    Args:
+        recordings: folders (with their subfolders) or files of whole bodies; $NAME stands for a variable
+            of the environment.
+        out: the model, NAME.safetensors.
+        choice: arguments of `RecordedMotion.gather`. recipe: of `BodyMotionRecipe`.
+        name: name in the model's metadata (default that of the file).
+        licence: licence of the recordings.
+        given: the command.
+    """
+    from torchpose.learning._body_motion_fit import BodyMotionRecipe
+    from torchpose.learning._fit_files import write_body_files
+    from torchpose.learning._recipes.body_motion import RecordedMotion
+
+    with _results(given, False) as (results, file, facts):
+        settings = BodyMotionRecipe(**recipe)
+        recorded = RecordedMotion.gather(recordings, **choice, progress=show_progress())
+        print(write_body_files(recorded, results, file.name, settings, **facts))
+    return 0
+
+
+_FITS = {"manifold": _manifold, "limbs": _limbs, "actions": _actions, "body": _body}

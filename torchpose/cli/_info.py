@@ -33,8 +33,8 @@ def main(arguments: list[str]) -> int:
 def run(what: str | None = None) -> int:
     """Print the version and the available priors, or a description of a file.
 
-    That is a prior, a manifold, limb conditionals, an action space or bank, a file of poses, keypoints or
-    recordings, or a camera file.
+    That is a prior, a manifold, limb conditionals, an action space or bank, a prior over the motion of
+    bodies, a file of poses, keypoints or recordings, or a camera file.
 
     Args:
         what: name of a prior or a model of whole bodies, a file or a folder.

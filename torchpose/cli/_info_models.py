@@ -1,4 +1,4 @@
-"""What `torchpose info` says of models of whole bodies (manifolds, limbs, actions) and of their poses."""
+"""What `torchpose info` says of models of whole bodies (manifolds, limbs, actions, motion) and of poses."""
 
 import math
 from collections.abc import Callable
@@ -105,6 +105,46 @@ def describe_bank(path: Path) -> Facts:
     }
 
 
+def describe_body_motion(path: Path) -> Facts:
+    """Return the facts about a prior over the motion of bodies: how fast each part accelerates."""
+    from torchpose.priors._body_motion import BodyMotion
+
+    motion = BodyMotion.load(path)
+    body, info = motion.articulation, motion.info
+    acceleration, decay = motion.acceleration.tolist(), motion.decay.tolist()
+    shifts = zip(body.shifted, motion.shift_std.tolist(), strict=True)
+    scales = zip(body.groups, motion.scale_cov.diagonal().sqrt().tolist(), strict=True)
+    return {
+        "body motion": info.name or "without a name",
+        "position": f"{acceleration[0]:.2g} m per s^1.5, decay {decay[0]:.2g} per s",
+        "angles": "\n".join(
+            f"{body.skeleton.parts[part]} about {'xyz'[axis]}: {q:.2g} rad per s^1.5, decay {beta:.2g} per s"
+            for part, axis, q, beta in zip(
+                body.axis_part.tolist(),
+                body.axis.tolist(),
+                acceleration[3:],
+                decay[3:],
+                strict=True,
+            )
+        ),
+        "shifts": ", ".join(f"{body.skeleton.names[j]} {100 * std:.1f} cm" for j, std in shifts),
+        "bone lengths": ", ".join(f"{name} +- {100 * std:.0f} %" for name, std in scales),
+        "poses": f"{len(motion.poses.weights)} components over {motion.poses.dim} angles",
+        "fps": _number(info.fps),
+        "frames": str(info.n_frames or ""),
+        "held out": _moved(info.extra),
+        "actions": _listed(info.actions),
+        **_origin(info),
+    }
+
+
+def _moved(extra: dict[str, Any]) -> str:
+    found = extra.get("held_out")
+    if not isinstance(found, dict) or not {"frames", "acceleration"} <= found.keys():
+        return ""
+    return f"{found['frames']} frames, accelerating {found['acceleration']:.2f} times as much"
+
+
 def _passed(info: Any, action: str) -> str:
     share = info.extra.get("accepted", {}).get(action)
     return "" if share is None else f"; {100 * share:.0f} % of held-out postures pass its gate"
@@ -115,6 +155,7 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
     "torchpose-limb-conditionals": describe_limbs,
     "torchpose-action-space": describe_action,
     "torchpose-action-bank": describe_bank,
+    "torchpose-body-motion": describe_body_motion,
 }
 """What describes a file, by `torchpose._core.tensor_file.format_of`."""
 

@@ -9,8 +9,10 @@ from typing import Any
 from torchpose._core.tensor_file import format_of
 from torchpose.errors import OutputError
 from torchpose.io._results import ResultsFolder
+from torchpose.learning._body_motion_fit import BodyMotionRecipe
 from torchpose.learning._model_card import MODES, BodyModel, body_card, model_card
 from torchpose.learning._recipes.actions import FittedActions
+from torchpose.learning._recipes.body_motion import RecordedMotion, fit_motion, motion_summary
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -19,6 +21,7 @@ __all__ = [
     "check_fit_file",
     "fit_results",
     "write_action_files",
+    "write_body_files",
     "write_fit",
     "write_limb_files",
     "write_manifold_files",
@@ -142,6 +145,24 @@ def write_limb_files(
     found, held_out = fit_limbs(states, least_std, **facts)
     written = write_fit(found, body_card(found), results, file)
     return f"{summary(found, held_out)}\n{_written(results, written)}"
+
+
+def write_body_files(
+    recorded: RecordedMotion,
+    results: ResultsFolder,
+    file: str,
+    recipe: BodyMotionRecipe,
+    **facts: str,
+) -> str:
+    """Fit how bodies move, write it and its card; return a report.
+
+    Args:
+        recorded: to fit to. results: folder of the files. file: name of the model's. recipe: settings.
+        facts: name, licence, command.
+    """
+    found, held_out = fit_motion(recorded, recipe, **facts)
+    written = write_fit(found, body_card(found), results, file)
+    return f"{motion_summary(found, held_out)}\n{_written(results, written)}"
 
 
 def write_action_files(

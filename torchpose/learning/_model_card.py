@@ -11,6 +11,7 @@ from typing import Any
 from torchpose._core.files import atomic_path
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -236,7 +237,7 @@ def _views(views: Mapping[str, Any]) -> str:
     return f"{angles}, {shifts}"
 
 
-BodyModel = BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank
+BodyModel = BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank | BodyMotion
 
 _LIMITS = (
     "It is not to be scored on the persons named above, and `torchpose evaluate` refuses that. It says "
@@ -244,13 +245,14 @@ _LIMITS = (
 )
 
 
-def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
+def body_card(model: BodyModel, name: str = "", results: str = "", chosen: str = "") -> str:
     """Return Markdown text on what a model is, what it was fitted to, and what it is not good for.
 
     Args:
-        model: a manifold, limb conditionals, an action space or a bank.
+        model: a manifold, limb conditionals, an action space or bank, or a prior over the motion of bodies.
         name: of the model, where its file does not say. results: what it scored on persons whom it was
             not fitted on, as Markdown.
+        chosen: how settings were chosen, as Markdown.
     """
     describe = next(text for kind, text in _DESCRIBED.items() if isinstance(model, kind))
     what, rows, held_out, use, limits = describe(model)
@@ -258,14 +260,19 @@ def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
         "What it is": what,
         "Fitted on": card_table({**_body_data(model.info), **rows}),
         "Held out while it was fitted": held_out,
+        "How its settings were chosen": chosen,
         "On persons that it was not fitted on": results,
-        "Use": f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {use} --out result\n```",
+        "Use": use,
         "Limits": f"{limits} {_LIMITS}",
     }
     return card_text(getattr(model.info, "name", "") or name or "Body model", sections)
 
 
 _Told = tuple[str, dict[str, Any], str, str, str]
+
+
+def _tracking(options: str) -> str:
+    return f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {options} --out result\n```"
 
 
 def _manifold(manifold: Any) -> _Told:
@@ -289,7 +296,7 @@ def _manifold(manifold: Any) -> _Told:
         "It knows one motion. Somebody who does anything else is pulled towards it, and poses that are "
         "not of the motion come out wrong."
     )
-    return what, rows, held_out, f"--manifold {_call(info.name)}", limits
+    return what, rows, held_out, _tracking(f"--manifold {_call(info.name)}"), limits
 
 
 def _limbs(limbs: Any) -> _Told:
@@ -311,7 +318,13 @@ def _limbs(limbs: Any) -> _Told:
         "It knows how these persons moved in these actions; limbs in other positions or faster ones are "
         "followed late or not at all."
     )
-    return what, rows, held_out, f"--method root --conditionals {_call(info.name)}", limits
+    return (
+        what,
+        rows,
+        held_out,
+        _tracking(f"--method root --conditionals {_call(info.name)}"),
+        limits,
+    )
 
 
 def _action(space: Any) -> _Told:
@@ -323,7 +336,13 @@ def _action(space: Any) -> _Told:
     held_out = _gates({info.name: accepted} if accepted is not None else {})
     rows = {"performances": info.performances, "frame rate": _rate(info.fps)}
     limits = "Somebody who does anything else is held in the postures of this action."
-    return what, rows, held_out, f"--method constrained --action {_call(info.name)}", limits
+    return (
+        what,
+        rows,
+        held_out,
+        _tracking(f"--method constrained --action {_call(info.name)}"),
+        limits,
+    )
 
 
 def _bank(bank: Any) -> _Told:
@@ -337,8 +356,41 @@ def _bank(bank: Any) -> _Told:
         "It knows these actions; what is done otherwise is taken for one of them or for none, when the "
         "constraint is released."
     )
-    use = f"--method constrained --action {_call(info.name)}"
+    use = _tracking(f"--method constrained --action {_call(info.name)}")
     return what, rows, _gates(info.extra.get("accepted", {})), use, limits
+
+
+def _body_motion(motion: Any) -> _Told:
+    info, found = motion.info, motion.info.extra.get("held_out")
+    settings = info.extra.get("settings", {})
+    n_poses = len(motion.poses.weights)
+    what = (
+        "How fast position and angles of a body accelerate and how their velocities decay "
+        "(Ornstein-Uhlenbeck processes), how far neck, shoulders and hips shift from rigid parts, mean and "
+        f"covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians over the "
+        "angles of all parts, half of them mirror images of the others. The Kalman filter over bodies from "
+        "keypoints uses it. Every set of recordings counts alike, except that poses have shares as the roots "
+        "of durations."
+    )
+    held_out = ""
+    if found:
+        held_out = (
+            f"Persons who were held out ({found['frames']:,} frames) accelerate "
+            f"{found['acceleration']:.2f} times as much as the prior has it. The log density of their poses "
+            f"is {found['log_density']:.2f} an angle, that of the persons above "
+            f"{found['fitted_log_density']:.2f}."
+        )
+    rows = {
+        "frames": f"{info.n_frames:,}",
+        "frame rate of its velocities": _rate(info.fps),
+        "settings": ", ".join(f"{key} {value:g}" for key, value in sorted(settings.items())),
+    }
+    limits = (
+        "It knows how these persons moved and what they did. Faster motion is followed late, and poses "
+        "unlike theirs are taken for others where cameras see little."
+    )
+    use = '`BodyTracker(..., method="kalman")` uses the one that comes with the package, "whole-body".'
+    return what, rows, held_out, use, limits
 
 
 _DESCRIBED: Mapping[type, Any] = {
@@ -346,6 +398,7 @@ _DESCRIBED: Mapping[type, Any] = {
     LimbConditionals: _limbs,
     ActionSpace: _action,
     ActionBank: _bank,
+    BodyMotion: _body_motion,
 }
 
 

@@ -18,9 +18,7 @@ from torchpose.errors import PriorError
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["BodyMotion", "BodyMotionInfo", "PosePull", "shipped_body_motion"]
-
-_SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "bodies" / "whole-body.safetensors"
+__all__ = ["BodyMotion", "BodyMotionInfo", "PosePull"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,7 @@ class BodyMotionInfo:
     Attributes:
         name: the name of the prior. persons: ids of the persons in the recordings. actions: what they did.
         sources: recordings or data sets. licence: the licence of the data. command: that made it.
+        fps: frames per second at which motion was looked at. n_frames: frames of all recordings.
         extra: anything else that JSON can hold.
     """
 
@@ -39,6 +38,8 @@ class BodyMotionInfo:
     sources: tuple[str, ...] = ()
     licence: str = ""
     command: str = ""
+    fps: float | None = None
+    n_frames: int = 0
     extra: dict[str, Any] = field(default_factory=dict)
 
 
@@ -74,9 +75,9 @@ class BodyMotion(nn.Module):
       over persons.
 
     Args:
-        acceleration: [3 + R], m or rad per s^1.5. decay: [3 + R], 1/s. shift_std: [S], metres, along each axis.
-        shift_time, pull_time: seconds.
-        scale_mean: [G]. scale_cov: [G, G]. poses: mixture over the Q relative angles of `Articulation`, radians.
+        acceleration: [3 + R], m or rad per s^1.5. decay: [3 + R], 1/s.
+        shift_std: [S], metres, along each axis. shift_time, pull_time: seconds.
+        scale_mean: [G]. scale_cov: [G, G]. poses: mixture over the Q `relative_angles` of `Articulation`.
         info: facts about the fit. articulation: of the bodies.
 
     Raises:
@@ -129,7 +130,8 @@ class BodyMotion(nn.Module):
     def pull(self, angles: Float[Tensor, "*batch Q"], cov: Float[Tensor, "*batch Q Q"]) -> PosePull:
         """Return the slope and curvature of the log density of poses, expected over its components.
 
-        sum_k r_k Sigma_k^-1 (mu_k - theta)   and   sum_k r_k Sigma_k^-1,   r_k ~ pi_k N(theta; mu_k, Sigma_k + P)
+        sum_k r_k Sigma_k^-1 (mu_k - theta)   and   sum_k r_k Sigma_k^-1,
+        r_k ~ pi_k N(theta; mu_k, Sigma_k + P)
 
         Args:
             angles: theta, radians. cov: P, of the angles.
@@ -170,9 +172,4 @@ class BodyMotion(nn.Module):
         info, tensors = read_tensors(path, _KIND)
         given = {name: value.double() for name, value in tensors.items()}
         poses = GaussianMixture(*(given.pop(n) for n in ("weights", "means", "covariances")))
-        return cls(**given, poses=poses, info=info)
-
-
-def shipped_body_motion() -> BodyMotion:
-    """Return the prior over bodies that comes with the package."""
-    return BodyMotion.load(_SHIPPED)
+        return cls(**given, poses=poses, info=info)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Load models that come with the package, by their names: manifolds, limb conditionals, actions."""
+"""Load models that come with the package, by their names: manifolds, limb conditionals, actions, bodies."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torchpose._core.tensor_file import format_of
 from torchpose.errors import OverlapError, PriorError
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 
@@ -18,6 +19,7 @@ __all__ = [
     "find_model",
     "known_models",
     "load_action",
+    "load_body_motion",
     "load_limb_conditionals",
     "load_manifold",
     "persons_of_model",
@@ -30,6 +32,7 @@ KINDS = {
     "manifolds": "a manifold",
     "conditionals": "limb conditionals",
     "actions": "an action space or bank",
+    "bodies": "a prior over the motion of bodies",
 }
 """Kinds of models, as their folders are called, and in words."""
 
@@ -38,7 +41,7 @@ def known_models(kind: str) -> list[str]:
     """Return the names of the models of a kind that come with the package.
 
     Args:
-        kind: "manifolds", "conditionals", "actions" or another folder of models.
+        kind: "manifolds", "conditionals", "actions", "bodies" or another folder of models.
 
     Returns:
         Names in alphabetical order; none for an unknown kind.
@@ -121,6 +124,24 @@ def load_action(name_or_path: str | Path) -> ActionSpace | ActionBank:
     path = find_model("actions", name_or_path)
     bank = format_of(path) == "torchpose-action-bank"
     return ActionBank.load(path) if bank else ActionSpace.load(path)
+
+
+def load_body_motion(name_or_path: str | Path) -> BodyMotion:
+    """Load a prior over the motion of bodies that comes with the package, by its name, or one from a file.
+
+    Args:
+        name_or_path: a name (``known_models("bodies")``), or a file of `torchpose fit body`.
+
+    Returns:
+        `BodyMotion` in float64.
+
+    Raises:
+        PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
+
+    >>> load_body_motion("whole-body").info.fps
+    30.0
+    """
+    return BodyMotion.load(find_model("bodies", name_or_path))
 
 
 def persons_of_model(model: Any) -> set[str]:

@@ -12,7 +12,8 @@ from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeError
-from torchpose.priors._body_motion import BodyMotion, shipped_body_motion
+from torchpose.priors._body_motion import BodyMotion
+from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import notes_of
@@ -85,7 +86,7 @@ class KeypointBodyTracker(nn.Module):
                 f"cameras must be given in metres, got camera {rig.names[int(far.argmax())]!r} "
                 f"{float(far.max()):g} m from the origin; divide translations in millimetres by 1000"
             )
-        motion = shipped_body_motion() if motion is None else motion
+        motion = load_body_motion("whole-body") if motion is None else motion
         if body is not None:
             motion = with_body(motion, body)
         elif height is not None:

@@ -5,7 +5,6 @@ import copy
 import torch
 from torch import Tensor
 
-from torchpose.body._articulation import Articulation
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import SkeletonError
@@ -26,7 +25,7 @@ def with_body(motion: BodyMotion, body: Body) -> BodyMotion:
     """
     if body.skeleton != BODY_15:
         raise SkeletonError(f"expected a body of 'body-15', got {body.skeleton.name!r}")
-    scales = _scales(motion.articulation, body.bone_lengths.to(motion.scale_mean))
+    scales = motion.articulation.scales_of(body.bone_lengths.to(motion.scale_mean))
     cov = _LENGTH_STD**2 * torch.eye(len(scales)).to(scales)
     return _with_scales(motion, scales, cov)
 
@@ -36,7 +35,7 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     body = motion.articulation
     told = torch.tensor([name in ("knee", "ankle") for name in body.groups]).to(motion.scale_mean)
     told = told / told.sum()
-    wanted = _scales(body, BODY_15.standard_lengths(height).to(motion.scale_mean)) @ told
+    wanted = body.scales_of(BODY_15.standard_lengths(height).to(motion.scale_mean)) @ told
     cross = motion.scale_cov @ told
     gain = cross / (told @ cross + _HEIGHT_STD**2)
     mean = motion.scale_mean + gain * (wanted - told @ motion.scale_mean)
@@ -59,13 +58,6 @@ def of_one_camera(motion: BodyMotion, lengths_fixed: bool) -> BodyMotion:
     pull_time = torch.full_like(motion.pull_time, _PULL_TIME_OF_ONE)
     other._buffers = {**motion._buffers, "pull_time": pull_time}
     return _with_scales(other, other.scale_mean, cov) if lengths_fixed else other
-
-
-def _scales(body: Articulation, lengths: Tensor) -> Tensor:
-    """Return the logs [G] of bone lengths [J] over the standard ones, both sides averaged."""
-    logs = (lengths[1:] / body.offsets[1:].norm(dim=-1)).log()
-    members = body.in_group[1:]
-    return (logs @ members) / members.sum(0)
 
 
 def _with_scales(motion: BodyMotion, mean: Tensor, cov: Tensor) -> BodyMotion:
