@@ -83,7 +83,12 @@ def _hierarchy(nodes: Sequence[BvhNode]) -> list[str]:
         lines += [f"{tab}{kind} {node.name}", f"{tab}{{", f"{tab}\t{_offset(node.offset)}",
                   f"{tab}\tCHANNELS {places} {_ROTATIONS}"]  # fmt: skip
         if i not in parents:
-            lines += [f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\t{_offset(_NOWHERE)}", f"{tab}\t}}"]
+            lines += [
+                f"{tab}\tEnd Site",
+                f"{tab}\t{{",
+                f"{tab}\t\t{_offset(_NOWHERE)}",
+                f"{tab}\t}}",
+            ]
     return lines + _closed(depths[-1:], 0)
 
 

@@ -132,9 +132,7 @@ def joints_to_bvh(joints: Float[Tensor, "T 8 3"]) -> BvhMotion:
     still = torch.eye(3, dtype=torch.float64).expand_as(root)
     nodes = [root, *(turned.get(name, still) for chain in _CHAINS for name in chain)]
     angles = bvh_angles(torch.stack(nodes, 1))
-    return BvhMotion(
-        torch.cat(lengths), where["neck"], angles, tuple(b.end for b in _BONES)
-    )
+    return BvhMotion(torch.cat(lengths), where["neck"], angles, tuple(b.end for b in _BONES))
 
 
 def _fill(joints: Tensor) -> Tensor:

@@ -218,9 +218,9 @@ class BodyTrack:
     def export(self, path: str | Path, *, up: str | None = None) -> None:
         """Write the poses for other programs: ``.trc`` (OpenSim), ``.c3d`` or ``.bvh``, by the suffix.
 
-        TRC and C3D hold `joints3d` as markers with the names of Pose2Sim (RHip, LKnee, CHip, ...), in metres
-        and in millimetres; the residuals of C3D are standard deviations. BVH holds the rigid body that `state`
-        turns, in centimetres. A frame rate that is not known is written as 30.
+        TRC and C3D hold `joints3d` as markers with the names of Pose2Sim (RHip, LKnee, CHip, ...), in
+        metres and in millimetres; the residuals of C3D are standard deviations. BVH holds the rigid body
+        that `state` turns, in centimetres. A frame rate that is not known is written as 30.
 
         Args:
             path: the file, which is replaced if there is one.
