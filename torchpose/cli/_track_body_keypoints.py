@@ -132,14 +132,21 @@ def _facts(
 ) -> dict[str, str]:
     """Return what was tracked, and how, by the name of each fact."""
     source = "files" if settings.detector is None else settings.detector.where
-    known = settings.tracker["body"] or settings.tracker["height"]
     return {
         "keypoints": f"{len(inputs)} cameras, {keypoints.fps:g} fps, by {source}",
         "method": poses.method + smoothing_text("full" if settings.smoothing == "full" else None),
-        "body": f"{poses.body.height:.2f} m, {'as given' if known else 'estimated'}",
+        "body": _body_text(poses, settings.tracker),
         "agreement": _agreement(keypoints, poses),
         "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
+
+
+def _body_text(poses: "BodyTrack", given: dict[str, Any]) -> str:
+    """Return whose body it is, or the height that its bones have."""
+    if given["body"] is not None:
+        return str(given["body"])
+    known = "" if given["height"] is None else f", {given['height']:g} m given"
+    return f"{poses.body.height:.2f} m by its bones{known}"
 
 
 def _agreement(keypoints: BodyKeypoints, poses: "BodyTrack") -> str:

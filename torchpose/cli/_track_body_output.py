@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -53,19 +53,25 @@ class BodyJob(NamedTuple):
     pictures: bool
 
 
+@runtime_checkable
 class DrawnVideos(Protocol):
-    """Declares the videos of all cameras, and how a body is drawn into them.
-
-    Attributes:
-        names: of the cameras. sizes: (width, height) of the videos. fps: frames per second.
-    """
+    """Declares the videos of all cameras, and how a body is drawn into them."""
 
     @property
-    def names(self) -> Sequence[str]: ...
+    def names(self) -> Sequence[str]:
+        """Return the names of the cameras."""
+        ...
+
     @property
-    def sizes(self) -> Sequence[tuple[int, int]]: ...
+    def sizes(self) -> Sequence[tuple[int, int]]:
+        """Return (width, height) of each video."""
+        ...
+
     @property
-    def fps(self) -> float: ...
+    def fps(self) -> float:
+        """Return the frames per second."""
+        ...
+
     def images(self) -> Iterator[tuple[Any, ...]]:
         """Read the frames of all cameras."""
         ...

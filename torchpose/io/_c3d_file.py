@@ -73,7 +73,7 @@ def _points(joints: Tensor, std: Tensor | None) -> NDArray[np.float32]:
     """Return x, y, z and residual [T, J, 4]."""
     points = np.zeros((*joints.shape[:2], 4), dtype="<f4")
     places = joints.detach().cpu().double().numpy() * _MILLIMETRES
-    missing = ~np.isfinite(places).all(-1)
+    missing = np.asarray(~np.isfinite(places).all(-1))
     points[..., :3] = np.where(missing[..., None], 0.0, places)
     if std is not None:
         check_shape("std", std, list(joints.shape[:2]))
