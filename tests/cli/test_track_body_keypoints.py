@@ -10,8 +10,10 @@ import torch
 from tests.cli.test_track_body import HEIGHT, WIDTH, N, arms_rise, looking_at
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, load_cameras, save_cameras
+from torchpose.cli._body_keypoint_inputs import read_body_keypoints
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.skeleton._joint_sets import SKELETONS
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 from torchpose.video import VideoWriter
 from torchpose.whole_body import BodyTrack
 
@@ -186,6 +188,30 @@ def test_inputs_of_other_lengths_sizes_and_rates(track, scene, tmp_path):
     assert (done.code, "one frame rate, got 25, 50 fps" in done.err) == (2, True)
     done = track(tmp_path / "c", *slow, "--fps", 50)
     assert (done.code, "25, 50 fps are taken at the given 50 fps" in done.out) == (0, True)
+
+
+def test_joint_sets_may_differ_between_cameras(track, scene, tmp_path):
+    """MediaPipe's landmarks have no neck and no pelvis; those of the prior over arms are not taken."""
+    points = scene[2]
+    marks = torch.full((N, len(LANDMARKS), 2), torch.nan, dtype=torch.float64)
+    for j, joint in enumerate(BODY_15.names):
+        if joint in LANDMARKS:
+            marks[:, LANDMARKS.index(joint)] = points[:, 1, j]
+    for ear, shift in (("left_ear", 2.0), ("right_ear", -2.0)):
+        marks[:, LANDMARKS.index(ear)] = points[:, 1, BODY_15.joint("head")] + shift
+    write_keypoints(tmp_path / "marks.npz", replace(keypoints_of(marks), names=LANDMARKS))
+    found = read_body_keypoints([str(tmp_path / "marks.npz")], [load_camera(scene)])
+    missing = torch.isnan(found.points[:, 0]).all(-1).all(0)
+    lacking = [name for name, gone in zip(BODY_15.names, missing, strict=True) if gone]
+    assert lacking == ["pelvis", "neck", "head"]
+    assert found.notes == ()
+    done = track(tmp_path / "out", "front_json", tmp_path / "marks.npz", "behind.npz", *PLAIN)
+    assert done.code == 0, done.err
+    assert apart(BodyTrack.load(tmp_path / "out" / "body.npz"), scene[1]) < 0.05
+
+
+def load_camera(scene):
+    return load_cameras(scene[0] / "cameras.toml")["left"]
 
 
 def test_delays_bring_cameras_in_step(track, scene, tmp_path):

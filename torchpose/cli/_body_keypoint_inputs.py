@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpose._core.terminal import show_progress
 from torchpose.cli._track import is_video
 from torchpose.errors import InputError, SkeletonError
+from torchpose.skeleton._mediapipe_landmarks import count_given
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
@@ -184,20 +185,25 @@ def _read(path: str, detector: DetectorSettings | None, fps: float | None) -> Ca
 
     found = read_keypoints(path)
     points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
-    return CameraKeypoints(points, confidence, found.fps, found.image_size, found.notes)
+    notes = found.notes if count_given(found.names) == len(found.names) else ()
+    return CameraKeypoints(points, confidence, found.fps, found.image_size, notes)
 
 
 def _of_body(
     source: str, points: Tensor, confidence: Tensor | None, names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
-    """Return keypoints [T, 15, 2] and confidence [T, 15] of the joints of `BODY_15`."""
+    """Return keypoints [T, 15, 2] and confidence [T, 15] of the joints of `BODY_15`.
+
+    Heads and necks that were put where the prior of the upper body has them are none of this body.
+    """
     from torchpose.body._skeleton import body_joints
 
     there = torch.isfinite(points).all(-1)
     trust = there.to(points) if confidence is None else confidence.to(points)
-    table = torch.cat([points, trust[..., None]], -1)
+    given = count_given(names)
+    table = torch.cat([points, trust[..., None]], -1)[..., :given, :]
     try:
-        joints = body_joints(table, names, middles=False)
+        joints = body_joints(table, names[:given], middles=False)
     except SkeletonError as error:
         raise SkeletonError(f"{source}: {error}") from error
     return joints[..., :2], joints[..., 2].nan_to_num(0.0)
