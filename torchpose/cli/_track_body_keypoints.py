@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.video._source_interface import VideoSource
     from torchpose.whole_body._body_track import BodyTrack
+    from torchpose.whole_body._body_tracker import BodyTracker
 
 __all__ = ["KeypointSettings", "track_keypoints"]
 
@@ -70,6 +71,7 @@ def track_keypoints(
         job: of the command. inputs: keypoints or videos, for each camera. cameras: calibrated.
         settings: the options.
     """
+    _tracker(cameras, 1.0, settings)  # wrong cameras and options are told before any work
     shown = settings.videos
     if shown is None and all(map(is_video, inputs)):
         shown = list(inputs)
@@ -92,14 +94,13 @@ def track_keypoints(
             print("torchpose: no camera has a keypoint, so there are no poses", file=sys.stderr)
             return 1
         written = results.commit(write_poses(job, results.stage, poses))
-        drawn = []
+        stage, drawn = results.stage, []
         if films is not None:
-            drawn = draw(films.showing(keypoints), poses, results.stage, overlay, job.pictures)
+            drawn = draw(films.showing(keypoints), poses, stage, overlay, job.pictures)
         if job.pictures:
-            drawn += [_write_skeleton(results.stage / "skeleton.png", poses, cameras[0])]
-        facts = _facts(inputs, keypoints, settings, poses, seconds)
-        drawn += write_page(cameras[0], poses, facts, results.stage)
-        written += results.commit(drawn)
+            drawn += [_write_skeleton(stage / "skeleton.png", poses, cameras[0])]
+        facts = _facts(keypoints, settings, poses, seconds)
+        written += results.commit([*drawn, *write_page(cameras[0], poses, facts, stage)])
     return summary(poses, facts, written, results.notes)
 
 
@@ -107,12 +108,18 @@ def _pictures(job: BodyJob, films: bool) -> list[str]:
     return [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
 
 
-def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "BodyTrack | None":
-    """Return the poses, or None if there is nobody."""
+def _tracker(
+    cameras: "Sequence[PinholeCamera]", fps: float, settings: KeypointSettings
+) -> "BodyTracker":
     from torchpose.whole_body._body_tracker import BodyTracker
     from torchpose.whole_body._keypoints.keypoint_body_tracker import KEYPOINT_METHOD
 
-    tracker = BodyTracker(keypoints.cameras, KEYPOINT_METHOD, fps=keypoints.fps, **settings.tracker)
+    return BodyTracker(cameras, KEYPOINT_METHOD, fps=fps, **settings.tracker)
+
+
+def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "BodyTrack | None":
+    """Return the poses, or None if there is nobody."""
+    tracker = _tracker(keypoints.cameras, keypoints.fps, settings)
     try:
         poses = tracker(
             keypoints=keypoints.points, confidence=keypoints.confidence,
@@ -124,16 +131,13 @@ def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "BodyTrack |
 
 
 def _facts(
-    inputs: Sequence[str],
-    keypoints: BodyKeypoints,
-    settings: KeypointSettings,
-    poses: "BodyTrack",
-    seconds: float,
+    keypoints: BodyKeypoints, settings: KeypointSettings, poses: "BodyTrack", seconds: float
 ) -> dict[str, str]:
     """Return what was tracked, and how, by the name of each fact."""
     source = "files" if settings.detector is None else settings.detector.where
+    n_cameras = len(keypoints.cameras)
     return {
-        "keypoints": f"{len(inputs)} cameras, {keypoints.fps:g} fps, by {source}",
+        "keypoints": f"{n_cameras} camera{'s' * (n_cameras > 1)}, {keypoints.fps:g} fps, by {source}",
         "method": poses.method + smoothing_text("full" if settings.smoothing == "full" else None),
         "body": _body_text(poses, settings.tracker),
         "agreement": _agreement(keypoints, poses),
