@@ -42,6 +42,16 @@ def test_silhouettes_of_another_scale_cover_their_place():
     assert not outlined[90, 110]
 
 
+def test_keypoints_are_yellow_crosses():
+    frame = np.full((120, 160, 3), 90, np.uint8)
+    nobody = torch.full((15, 2), torch.nan, dtype=torch.float64)
+    seen = torch.tensor([[40.0, 60.0], [torch.nan, torch.nan]])
+    drawn = draw_body(frame, nobody, keypoints=seen)
+    red, green, blue = drawn[60, 40].astype(int)
+    assert min(red, green) > blue + 80
+    assert not (drawn[:, 80:] != frame[:, 80:]).any()
+
+
 def test_bad_input_is_refused():
     with pytest.raises(InputError):
         draw_body(np.zeros((4, 4), np.uint8), joints())

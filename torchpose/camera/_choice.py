@@ -1,13 +1,21 @@
-"""Choose the camera of an input: the one given, the one that the input names, or a reported guess."""
+"""Choose the camera of an input: the one given, the one that the input names, or a reported guess.
+
+A calibrated camera is fitted to the size of the images that the input has.
+"""
 
 from pathlib import Path
 
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._projection import intrinsics
+from torchpose.camera._rig import scale_matrix
 from torchpose.errors import CameraError
 
-__all__ = ["resolve_camera"]
+__all__ = ["fit_to_size", "is_padded", "resolve_camera"]
+
+_BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
+_SQUEEZED = 0.02  # of the ratio of the sides: images of another shape are cut, and not scaled
 
 
 def resolve_camera(
@@ -71,3 +79,45 @@ def _given_camera(given: str, name: str | None) -> PinholeCamera:
 
 def _text(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]} pixels"
+
+
+def is_padded(calibrated: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Return whether images are calibrated with up to 15 columns and rows more, as codecs store them.
+
+    Args:
+        calibrated, size: (width, height) of the calibration and of the images.
+    """
+    return all(0 <= c - s < _BLOCK for c, s in zip(calibrated, size, strict=True))
+
+
+def fit_to_size(
+    camera: PinholeCamera, size: tuple[int, int] | None, source: object
+) -> tuple[PinholeCamera, tuple[str, ...]]:
+    """Return the camera for images of a size, and a note if it is scaled.
+
+    Args:
+        camera: calibrated. size: (width, height) of the images, pixels, None if it is not known.
+        source: what the images are of, for messages.
+
+    Raises:
+        CameraError: images of another shape.
+    """
+    calibrated = camera.image_size
+    if size is None or calibrated is None or is_padded(calibrated, size):
+        return camera, ()
+    sx, sy = size[0] / calibrated[0], size[1] / calibrated[1]
+    if abs(sx / sy - 1) > _SQUEEZED:
+        raise CameraError(
+            f"{source}: is of {_text(size)}, and camera {camera.name!r} is calibrated for "
+            f"{_text(calibrated)}: images of another shape are cut, so the calibration must be of them"
+        )
+    fx, fy, skew, cx, cy = map(float, intrinsics(scale_matrix(camera.matrix, sx, sy)))
+    scaled = PinholeCamera(
+        fx, fy, cx, cy, *size, camera.name, skew=skew, distortions=camera.distortions.tolist(),
+        rotation=camera.rotation.tolist(), translation=camera.translation.tolist(),
+        fisheye=camera.fisheye,
+    )  # fmt: skip
+    note = (
+        f"camera {camera.name} is scaled from {_text(calibrated)} to the {_text(size)} of {source}"
+    )
+    return scaled, (note,)

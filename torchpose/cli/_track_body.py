@@ -1,18 +1,19 @@
-"""`torchpose track-body`: videos of calibrated cameras to the 3D poses of a whole body."""
+"""`torchpose track-body`: keypoints or videos of calibrated cameras to the 3D poses of a whole body."""
 
 import sys
 import time
 import warnings
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from torchpose._core.checks import check_positive
+from torchpose._core.checks import check_choice, check_positive
 from torchpose._core.terminal import show_progress
 from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible, share_cores
 from torchpose.cli._options import Option, options_of, options_of_methods
 from torchpose.cli._track_body_output import (
+    BodyJob,
     Recordings,
     body_results,
     draw,
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_tracker import BodyTracker
 
 _EXAMPLES = """
+torchpose track-body cameras.toml cam1_json/ cam2_json/ --fps 60 --smoothing full --out result
+torchpose track-body cameras.toml cam1.npz cam2.csv --videos cam1.mp4 cam2.mp4 --out result
+torchpose track-body cameras.toml cam1.mp4 cam2.mp4 --detector rtmpose-m.onnx --out result
+torchpose track-body cameras.toml cam*.npz --formats trc c3d bvh --up z --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
 torchpose track-body cameras.toml cam*.mp4 --background empty*.png --height 1.82 --out result
 torchpose track-body cameras.toml cam*.mp4 --manifold walk --out result
@@ -43,6 +48,12 @@ PYTHON_ONLY = frozenset({
     "velocity_rate", "max_redraws", "gate_width",
 })  # fmt: skip
 """Options of the shipped filters that only Python has: what the papers' experiments vary."""
+_OF_SILHOUETTES = (
+    "background", "ignore_still", "initial_pose", "facing", "rows", "sharpness", "manifold",
+    "conditionals", "action", "n_particles",
+)  # fmt: skip
+_OF_KEYPOINTS = ("smoothing", "videos", "keypoint_std", "pixel_std", "min_confidence")
+_BY_KEYPOINTS = "kalman"
 
 
 def main(arguments: list[str]) -> int:
@@ -63,8 +74,16 @@ def command() -> Command:
             "tracker": options_of(BodyTracker, ("cameras", "method", "fps")),
             "method_options": _method_options(),
         },
-        spaced=("videos", "background"),
-        metavars={"cameras": "CAMERAS", "method": "|".join(METHODS), "background": "FILE"},
+        spaced=("inputs", "background", "videos", "formats"),
+        metavars={
+            "cameras": "CAMERAS",
+            "inputs": "INPUT",
+            "method": "|".join((_BY_KEYPOINTS, *METHODS)),
+            "background": "FILE",
+            "detector": "FILE|package:factory",
+            "formats": "trc|c3d|bvh",
+            "smoothing": "none|full",
+        },
     )
 
 
@@ -81,10 +100,14 @@ def _method_options() -> tuple[Option, ...]:
 
 def run(
     cameras: str,
-    videos: list[str],
+    inputs: list[str],
     *,
     out: str,
     camera_names: list[str] | None = None,
+    detector: str | None = None,
+    min_confidence: float | None = None,
+    smoothing: Literal["none", "full"] = "none",
+    videos: list[str] | None = None,
     background: list[str] | None = None,
     ignore_still: bool = False,
     method: str | None = None,
@@ -97,28 +120,38 @@ def run(
     fps: float | None = None,
     delays: list[int] | None = None,
     seed: int = 0,
+    formats: list[str] | None = None,
+    up: Literal["y", "z"] | None = None,
     overlay: bool = True,
     pictures: bool = True,
     given: Given,
 ) -> int:
-    """Track one person's whole body through videos of calibrated cameras, by silhouettes.
+    """Track one person's whole body in calibrated cameras: by 2D keypoints, or in videos by silhouettes.
 
-    The cameras stand still. Writes body.npz, joints.csv, an overlay of every camera, report.html and a
-    picture into a folder.
+    The cameras stand still. Keypoints are those of files, or with --detector those that a model finds in
+    videos; one camera is enough for them. Writes body.npz, joints.csv, an overlay of every camera,
+    report.html and pictures into a folder.
 
     Args:
         cameras: TOML file with a table per camera: size, matrix, distortions, and its pose.
-        videos: a video or a folder of images per camera, in the order of the file, in step.
+        inputs: an input per camera, in the order of the file, in step: keypoints (.npz, .csv or a folder of
+            OpenPose JSON files), or a video or a folder of images.
         out: folder of the results.
-        camera_names: which cameras of the file the videos are of, if not all in order.
+        camera_names: which cameras of the file the inputs are of, if not all in order.
+        detector: find keypoints in the videos: a model in ONNX (.onnx), a pose landmarker of MediaPipe
+            (.task), or package:factory, a Python callable that returns a detector.
+        min_confidence: with --detector: of a keypoint, below which it counts as missing (default 0.3).
+        smoothing: keypoints: "full" lets later frames count too.
+        videos: keypoints: a video per camera, into which the body is drawn; by default the inputs, if they
+            are videos.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
             what stays in a video is its background, so the person has to move about.
         ignore_still: with --background: take what always looks the same in a video for an object that was
             moved since the scene was empty, and not for the person; not if the person stands still.
-        method: the particle filter: mrpf, regularised by a manifold (needs --manifold); apf, annealed;
-            sir, plain; root, hypotheses of the root with Gaussian limbs (needs --conditionals); or
-            constrained, to an action (needs --action). By default the one that suits the file given, else
-            apf.
+        method: of keypoints kalman. The others are particle filters on silhouettes: mrpf, regularised by a
+            manifold (needs --manifold); apf, annealed; sir, plain; root, hypotheses of the root with Gaussian
+            limbs (needs --conditionals); or constrained, to an action (needs --action). By default the one
+            that suits the inputs and the file given, else apf.
         tracker: the arguments of `BodyTracker`.
         initial_pose: a body.npz whose first pose the person begins with; without it, that pose is found.
         facing: the direction in which the person looks at first, in world axes; without it, the first
@@ -128,28 +161,40 @@ def run(
         sharpness: the exponent of the likelihood; not for root (default 100, for the overlap that
             constrained uses 30; the papers have 1).
         method_options: the options of the filter.
-        fps: the frame rate at which all videos are read.
-        delays: the number of frames by which each video began too early (default none).
-        seed: the seed of the filter.
+        fps: the frame rate at which all videos are read, and which keypoints have.
+        delays: the number of frames by which each input began too early (default none).
+        seed: the seed of the filter; kalman has none.
+        formats: also write the poses as body.trc, body.c3d or body.bvh.
+        up: with --formats: the axis of the cameras' world that points up; the files then have y up. By
+            default they have the axes of the world.
         overlay: write a video per camera with the body drawn into it.
-        pictures: write overlay.png.
+        pictures: write overlay.png, and of keypoints skeleton.png.
         given: the command.
 
     Returns:
         The exit code: 1 if nobody was seen or the filter lost the person.
     """
+    from torchpose.cli._body_keypoint_inputs import are_keypoints
+
+    by_keypoints = are_keypoints(inputs, detector)
     _check(given.values)
+    _refuse_others(given, by_keypoints)
     share_cores()
-    found = _cameras(cameras, camera_names, len(videos))
+    found = _cameras(cameras, camera_names, len(inputs))
+    job = BodyJob(
+        out, given.files(), tuple(dict.fromkeys(formats or ())), up, overlay,
+        pictures_possible(pictures),
+    )  # fmt: skip
+    if by_keypoints:
+        return _run_on_keypoints(job, inputs, found, given.values, tracker)
     options = {"sharpness": sharpness, **method_options}
     options = {name: value for name, value in options.items() if value is not None}
     tracker |= _models(method, tracker, options, initial_pose)
-    pictures = pictures_possible(pictures)
     with ExitStack() as stack:
-        files = given.files()
-        results = stack.enter_context(body_results(out, files, found, overlay, pictures))
+        drawn = ["overlay.png"] if job.pictures else []
+        results = stack.enter_context(body_results(job, found, overlay, drawn))
         recordings = Recordings(
-            videos, found, rows, fps=fps, delays=delays, background=background,
+            inputs, found, rows, fps=fps, delays=delays, background=background,
             ignore_still=ignore_still,
         )  # fmt: skip
         with recordings:
@@ -163,43 +208,99 @@ def run(
                     file=sys.stderr,
                 )
                 return 1
-            written = results.commit(write_poses(results.stage, poses))
+            written = results.commit(write_poses(job, results.stage, poses))
             shown = []
-            if overlay or pictures:
-                shown = draw(recordings, poses, results.stage, overlay, pictures)
+            if overlay or job.pictures:
+                shown = draw(recordings, poses, results.stage, overlay, job.pictures)
         facts = facts_of(given, body_tracker, recordings, poses, seconds)
-        shown += write_page(recordings, poses, facts, results.stage)
+        shown += write_page(recordings.views[0].source, poses, facts, results.stage)
         written += results.commit(shown)
     return summary(poses, facts, written, results.notes)
 
 
+def _run_on_keypoints(
+    job: BodyJob,
+    inputs: list[str],
+    cameras: "list[PinholeCamera]",
+    values: dict[str, Any],
+    tracker: dict[str, Any],
+) -> int:
+    """Track by keypoints, and return the exit code."""
+    from torchpose.cli._body_keypoint_inputs import DetectorSettings
+    from torchpose.cli._track_body_keypoints import KeypointSettings, track_keypoints
+
+    detector = None
+    if values["detector"] is not None:
+        detector = DetectorSettings(values["detector"], values["min_confidence"])
+    arguments = {name: tracker[name] for name in ("body", "height", "keypoint_std", "pixel_std")}
+    settings = KeypointSettings(
+        detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments
+    )
+    return track_keypoints(job, inputs, cameras, settings)
+
+
+def _refuse_others(given: Given, by_keypoints: bool) -> None:
+    """Raise `InputError` for a method and options that do not go with the inputs."""
+    method, detector = given.values["method"], given.values["detector"]
+    if by_keypoints and method not in (None, _BY_KEYPOINTS):
+        raise InputError(
+            f"--method {method} takes silhouettes of videos, and keypoints are given: they take "
+            f"{_BY_KEYPOINTS}, which needs no --method"
+        )
+    if not by_keypoints and method == _BY_KEYPOINTS:
+        raise InputError(
+            f"--method {method} takes keypoints: .npz, .csv or folders of OpenPose JSON files in place of "
+            "videos, or --detector, which finds them"
+        )
+    there = "keypoints are given" if by_keypoints else "the inputs are videos without --detector"
+    why = (
+        "silhouettes of videos, which are not computed where" if by_keypoints else "keypoints, and"
+    )
+    refused: tuple[str, ...] = _OF_KEYPOINTS
+    if by_keypoints:
+        refused = (*_OF_SILHOUETTES, *(option.key for option in _method_options()))
+    for key in refused:
+        if given.values[key] != given.defaults[key]:
+            raise InputError(f"--{key.replace('_', '-')} is for {why} {there}; leave it out")
+    if by_keypoints and detector is None and given.values["min_confidence"] is not None:
+        raise InputError(
+            "--min-confidence is for --detector; confidences of files count as they are"
+        )
+
+
 def _check(values: dict[str, Any]) -> None:
-    """Raise `InputError` for values out of range, and for lists that do not go with the videos."""
-    for key in ("height", "sharpness", "rows", "n_particles", "fps"):
+    """Raise `InputError` for values out of range, and for lists that do not go with the inputs."""
+    from torchpose.whole_body._body_files import BODY_FORMATS
+
+    for key in ("height", "sharpness", "rows", "n_particles", "fps", "keypoint_std", "pixel_std"):
         if values[key] is not None:
             check_positive(f"--{key.replace('_', '-')}", values[key])
-    facing, n_videos = values["facing"], len(values["videos"])
+    facing, n_inputs = values["facing"], len(values["inputs"])
     if facing is not None and len(facing) != 3:
         raise InputError(f"--facing must be three numbers, got {facing}")
     if values["ignore_still"] and not values["background"]:
         raise InputError("--ignore-still true needs --background")
-    for key in ("background", "delays"):
+    for key in ("background", "delays", "videos"):
         given = values[key]
-        if given and len(given) != n_videos:
+        if given and len(given) != n_inputs:
             raise InputError(
-                f"--{key} needs one entry for each of the {n_videos} videos, got {len(given)}"
+                f"--{key} needs one entry for each of the {n_inputs} cameras, got {len(given)}"
             )
+    for kind in values["formats"] or ():
+        check_choice("--formats", kind, BODY_FORMATS)
+    if values["up"] is not None and not values["formats"]:
+        raise InputError("--up is for the files of --formats; the other results are in world axes")
 
 
-def _cameras(file: str, names: list[str] | None, n_videos: int) -> "list[PinholeCamera]":
+def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[PinholeCamera]":
     from torchpose.camera._pinhole import load_cameras
 
     found = load_cameras(file)
     names = list(found) if names is None else names
     missing = [name for name in names if name not in found]
-    if missing or len(names) != n_videos:
+    if missing or len(names) != n_inputs:
         raise CameraError(
-            f"{file}: expected a camera for each of the {n_videos} videos, got "
+            f"{file}: expected a camera for each of the {n_inputs} inputs, got "
             f"{', '.join(names)}; it holds {', '.join(found)} (choose by --camera-names)"
         )
     return [found[name] for name in names]

@@ -1,10 +1,10 @@
 """What `torchpose track-body` reads, writes and prints: videos as silhouettes, poses, pictures, words."""
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_tracker import BodyTracker
 
 __all__ = [
+    "BodyJob",
     "Recordings",
     "action_text",
     "body_results",
@@ -31,8 +32,53 @@ __all__ = [
 ]
 
 _POSES = ("body.npz", "joints.csv")
-_OWN = r"body\.npz|joints\.csv|overlay(_.+\.mp4|\.png)|report\.html"
+_OWN = r"body\.(npz|trc|c3d|bvh)|joints\.csv|overlay(_.+\.mp4|\.png)|skeleton\.png|report\.html"
 _MOST_RUNS = 8  # of actions that are listed by their frames
+
+
+class BodyJob(NamedTuple):
+    """Holds what a run of the command writes, and where.
+
+    Attributes:
+        out: folder of the results. files: that the command reads.
+        formats: suffixes of further files of the poses. up: the axis that points up, None if it is not told.
+        overlay, pictures: whether a video per camera, and pictures, are wanted.
+    """
+
+    out: str
+    files: list[Path]
+    formats: tuple[str, ...]
+    up: str | None
+    overlay: bool
+    pictures: bool
+
+
+@runtime_checkable
+class DrawnVideos(Protocol):
+    """Declares the videos of all cameras, and how a body is drawn into them."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Return the names of the cameras."""
+        ...
+
+    @property
+    def sizes(self) -> Sequence[tuple[int, int]]:
+        """Return (width, height) of each video."""
+        ...
+
+    @property
+    def fps(self) -> float:
+        """Return the frames per second."""
+        ...
+
+    def images(self) -> Iterator[tuple[Any, ...]]:
+        """Read the frames of all cameras."""
+        ...
+
+    def drawn(self, poses: "BodyTrack", t: int, images: Sequence[Any]) -> list[Any]:
+        """Return the images of frame t of all cameras with the body."""
+        ...
 
 
 class Recordings:
@@ -87,6 +133,16 @@ class Recordings:
         return float(self.sources[0].fps)
 
     @property
+    def names(self) -> Sequence[str]:
+        """Return the names of the cameras."""
+        return self.rig.names
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Return (width, height) of each video."""
+        return [view.size for view in self.views]
+
+    @property
     def n_frames(self) -> int | None:
         """Return how many frames to expect, None if unknown."""
         counts = [s.n_frames for s in self.sources if s.n_frames is not None]
@@ -129,6 +185,25 @@ class Recordings:
             for source in sources:
                 source.close()
 
+    def drawn(self, poses: "BodyTrack", t: int, images: Sequence[Any]) -> list[Any]:
+        """Return the images of frame t of all cameras with the body and the outline."""
+        from torchpose.video._overlay import draw_body
+        from torchpose.whole_body._silhouettes.rendering import render
+
+        k, rig = t - poses.first_frame, self.rig
+        height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
+        model = render(poses.body, poses.state[k], rig, height, width)
+        measured = self.kept(t)
+        drawn = []
+        for c, (view, image) in enumerate(zip(self.views, images, strict=True)):
+            part = _inside(view)
+            joints = project_joints(poses.joints3d[k], view.source)
+            drawn.append(
+                draw_body(image, joints, poses.body.skeleton,
+                          model=model[c][part], silhouette=measured[c][part])
+            )  # fmt: skip
+        return drawn
+
     def _open(self) -> "list[VideoSource]":
         from torchpose.video._source import open_video
 
@@ -161,40 +236,43 @@ class Recordings:
 
 
 def body_results(
-    out: str,
-    files: Sequence[Path],
-    cameras: "Sequence[PinholeCamera]",
-    overlay: bool,
-    pictures: bool,
+    job: BodyJob, cameras: "Sequence[PinholeCamera]", overlay: bool, pictures: Sequence[str]
 ) -> "ResultsFolder":
-    """Return the folder of `--out`, for poses of a body and what shows them.
+    """Return the folder of the results, for poses of a body and what shows them.
 
     Args:
-        out: folder of the results. files: that the command reads. cameras: of the videos.
-        overlay, pictures: whether a video per camera, and a picture, are going to be written.
+        job: of the command. cameras: of the videos. overlay: whether a video per camera is going to be
+            written. pictures: the names of those that are.
     """
     from torchpose.io._results import ResultsFolder, holds_arrays
 
     videos = [_overlay_name(camera.name) for camera in cameras] if overlay else []
     return ResultsFolder(
-        out,
+        job.out,
         "track",
         _OWN,
-        [*_POSES, *videos, *(["overlay.png"] if pictures else []), "report.html"],
-        files,
+        [*_POSES, *_exports(job), *videos, *pictures, "report.html"],
+        job.files,
         lambda folder: holds_arrays(folder / _POSES[0], ("state", "joints3d", "body_skeleton")),
     )
+
+
+def _exports(job: BodyJob) -> list[str]:
+    return [f"body.{suffix}" for suffix in job.formats]
 
 
 def _overlay_name(camera: str) -> str:
     return f"overlay_{camera}.mp4"
 
 
-def write_poses(out: Path, poses: "BodyTrack") -> list[Path]:
-    """Write the poses as an .npz and as a table."""
+def write_poses(job: BodyJob, out: Path, poses: "BodyTrack") -> list[Path]:
+    """Write the poses as an .npz, as a table, and in the formats of other programs."""
     written = [out / name for name in _POSES]
     poses.save(written[0])
     _write_csv(written[1], poses)
+    for name in _exports(job):
+        poses.export(out / name, up=job.up)
+        written.append(out / name)
     return written
 
 
@@ -203,9 +281,8 @@ def _write_csv(path: Path, poses: "BodyTrack") -> None:
     from torchpose._core.files import atomic_path
 
     columns = [f"{n}_{axis}" for n in poses.names for axis in ("x", "y", "z", "std")]
-    spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).div(3).sqrt()
     rows = poses.joints3d.new_zeros(len(poses), len(poses.names), 4)
-    rows[..., :3], rows[..., 3:] = poses.joints3d, spread
+    rows[..., :3], rows[..., 3] = poses.joints3d, poses.joints_std()
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(",".join(["frame", *columns, "coasting"]) + "\n")
         for t, (row, coasting) in enumerate(zip(rows.flatten(1).tolist(), poses.coasting.tolist(),
@@ -215,28 +292,27 @@ def _write_csv(path: Path, poses: "BodyTrack") -> None:
 
 
 def draw(
-    recordings: "Recordings", poses: "BodyTrack", out: Path, videos: bool, picture: bool
+    films: DrawnVideos, poses: "BodyTrack", out: Path, videos: bool, picture: bool
 ) -> list[Path]:
     """Draw the body into the frames of every camera: videos, and some frames as one picture."""
     from contextlib import ExitStack
 
     from torchpose.video._writer import VideoWriter
 
-    names = recordings.rig.names
-    files = [out / _overlay_name(name) for name in names] if videos else []
+    files = [out / _overlay_name(name) for name in films.names] if videos else []
     chosen = {round(i * (len(poses) - 1) / 5) + poses.first_frame for i in range(6)}
     strip: list[list[Any]] = []
     with ExitStack() as stack:
         writers = [
-            stack.enter_context(VideoWriter(file, recordings.fps, view.size))
-            for file, view in zip(files, recordings.views, strict=False)
+            stack.enter_context(VideoWriter(file, films.fps, size))
+            for file, size in zip(files, films.sizes, strict=False)
         ]
-        for t, images in enumerate(recordings.images()):
+        for t, images in enumerate(films.images()):
             if t < poses.first_frame or t - poses.first_frame >= len(poses):
                 continue
             if not videos and t not in chosen:
                 continue
-            drawn = _drawn(recordings, poses, t, images)
+            drawn = films.drawn(poses, t, images)
             for writer, image in zip(writers, drawn, strict=False):
                 writer.write(image)
             if t in chosen:
@@ -244,26 +320,6 @@ def draw(
     if picture and strip:
         files.append(_write_strip(out / "overlay.png", strip))
     return files
-
-
-def _drawn(
-    recordings: "Recordings", poses: "BodyTrack", t: int, images: Iterable[Any]
-) -> list[Any]:
-    from torchpose.video._overlay import draw_body
-    from torchpose.whole_body._silhouettes.rendering import render
-
-    k, rig = t - poses.first_frame, recordings.rig
-    height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
-    model = render(poses.body, poses.state[k], rig, height, width)
-    measured = recordings.kept(t)
-    drawn = []
-    for c, (view, image) in enumerate(zip(recordings.views, images, strict=True)):
-        part = _inside(view)
-        drawn.append(
-            draw_body(image, project_joints(poses.joints3d[k], view.source), poses.body.skeleton,
-                      model=model[c][part], silhouette=measured[c][part])
-        )  # fmt: skip
-    return drawn
 
 
 def _inside(view: "SilhouetteView") -> tuple[slice, slice]:
@@ -328,7 +384,7 @@ def facts_of(
         + ("against the empty scene" if recordings.background else "against what stays"),
         "method": f"{tracker.method}, {tracker.n_particles} particles{sharpness}",
         "learnt": ", ".join(filter(None, map(values.get, ("manifold", "conditionals", "action")))),
-        "body": values["body"] or f"average proportions, {values['height']:g} m",
+        "body": values["body"] or f"average proportions, {tracker.upright.height:.3g} m",
         "actions": action_text(poses),
         "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
@@ -356,13 +412,12 @@ def action_text(poses: "BodyTrack") -> str:
 
 
 def write_page(
-    recordings: "Recordings", poses: "BodyTrack", facts: dict[str, str], out: Path
+    camera: "PinholeCamera", poses: "BodyTrack", facts: dict[str, str], out: Path
 ) -> list[Path]:
-    """Write the page with the first camera's overlay, the skeleton and curves."""
+    """Write the page with the first camera's overlay, if there is one, the skeleton and curves."""
     from torchpose.viz._report.page import write_report
 
-    camera = recordings.views[0].source
-    overlay = out / _overlay_name(recordings.rig.names[0])
+    overlay = out / _overlay_name(camera.name)
     bones = [(p, j) for j, p in enumerate(poses.body.skeleton.parents) if p >= 0]
     page = write_report(
         out / "report.html", [poses.seen_by(camera)], overlay=overlay if overlay.exists() else None,
@@ -381,9 +436,9 @@ def summary(
     print(f"{'frames':<12} {len(poses)} from frame {poses.first_frame}")
     coasting, respread = int(poses.coasting.sum()), int(poses.respread.sum())
     if coasting:
-        print(f"{'unseen':<12} {coasting} frames, in which the pose only diffused")
+        print(f"{'unseen':<12} {coasting} frames, in which the pose is a prediction")
     if respread:
-        print(f"{'lost':<12} {respread} frames, in which particles were spread anew")
+        print(f"{'lost':<12} {respread} frames, in which the search began anew")
     for note in (*poses.notes, *notes):
         print(f"{'note':<12} {note}")
     print(f"{'written':<12} " + ", ".join(map(str, written)))

@@ -16,7 +16,7 @@ from torchpose._core.checks import check_shape
 from torchpose.errors import SkeletonError
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = ["DERIVED_JOINTS", "LANDMARKS", "derive_joints", "lacks_joints"]
+__all__ = ["DERIVED_JOINTS", "LANDMARKS", "count_given", "derive_joints", "lacks_joints"]
 
 LANDMARKS = (
     "nose",
@@ -49,6 +49,17 @@ def lacks_joints(names: Sequence[str]) -> bool:
     """
     known = set(canonical_names(names))
     return known.issuperset(_NEEDED) and known.isdisjoint(DERIVED_JOINTS)
+
+
+def count_given(names: Sequence[str]) -> int:
+    """Return how many of these joints are measured, and not appended by `derive_joints`.
+
+    >>> count_given((*LANDMARKS, *DERIVED_JOINTS)), count_given(["head", "neck"])
+    (33, 2)
+    """
+    given = names[: -len(DERIVED_JOINTS)]
+    appended = tuple(names[len(given) :]) == DERIVED_JOINTS and lacks_joints(given)
+    return len(given) if appended else len(names)
 
 
 def derive_joints(

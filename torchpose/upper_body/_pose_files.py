@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch import Tensor
 from torchpose._core.checks import check_shape
 from torchpose._core.files import atomic_path
 from torchpose.errors import InputError
-from torchpose.math._rotations import matrix_to_euler
+from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._pose_track import PoseTrack
 
@@ -95,16 +94,7 @@ def write_bvh(track: PoseTrack, path: str | Path) -> None:
     if len(track) != 1:
         raise InputError(f"a BVH file holds one sequence, got {len(track)}; see PoseTrack.sequence")
     motion = joints_to_bvh(track.joints3d[0])
-    rows = torch.cat([motion.position, motion.angles.flatten(1)], 1).numpy()
-    header = [
-        "HIERARCHY",
-        *_hierarchy(motion),
-        "MOTION",
-        f"Frames: {len(rows)}",
-        f"Frame Time: {1 / (track.fps or _FPS):.8f}",
-    ]
-    with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as stream:
-        np.savetxt(stream, rows, fmt="%.6f", header="\n".join(header), comments="")
+    write_bvh_motion(path, _nodes(motion), motion.position, motion.angles, track.fps or _FPS)
 
 
 def joints_to_bvh(joints: Float[Tensor, "T 8 3"]) -> BvhMotion:
@@ -141,11 +131,8 @@ def joints_to_bvh(joints: Float[Tensor, "T 8 3"]) -> BvhMotion:
             parent = parent[:, 1:]  # nothing follows the head
     still = torch.eye(3, dtype=torch.float64).expand_as(root)
     nodes = [root, *(turned.get(name, still) for chain in _CHAINS for name in chain)]
-    angles = torch.rad2deg(matrix_to_euler(torch.stack(nodes, 1), "zxy"))
-    smooth = np.unwrap(angles.numpy(), axis=0, period=360.0)  # no jumps by a whole turn
-    return BvhMotion(
-        torch.cat(lengths), where["neck"], torch.from_numpy(smooth), tuple(b.end for b in _BONES)
-    )
+    angles = bvh_angles(torch.stack(nodes, 1))
+    return BvhMotion(torch.cat(lengths), where["neck"], angles, tuple(b.end for b in _BONES))
 
 
 def _fill(joints: Tensor) -> Tensor:
@@ -197,30 +184,18 @@ def _shortest_arc(
     return torch.where(opposite, half_turn, arc)
 
 
-def _hierarchy(motion: BvhMotion) -> list[str]:
-    """Return lines of the nodes with their offsets at rest."""
+def _nodes(motion: BvhMotion) -> list[BvhNode]:
+    """Return the nodes with their offsets at rest."""
     lengths = dict(zip(motion.ends, motion.lengths.tolist(), strict=True))
-    offsets = {
-        bone.end: [lengths[bone.end] * part for part in bone.rest] for bone in _BONES
-    }  # what is no end of a bone starts in the neck
-    rotations = "Zrotation Xrotation Yrotation"
-    lines = ["ROOT neck", "{", "\tOFFSET 0.000000 0.000000 0.000000",
-             f"\tCHANNELS 6 Xposition Yposition Zposition {rotations}"]  # fmt: skip
+    rests = {bone.end: bone.rest for bone in _BONES}  # what is no end of a bone starts in the neck
+    nodes = [BvhNode("neck", -1)]
     for chain in _CHAINS:
-        for depth, name in enumerate(chain, start=1):
-            tab = "\t" * depth
-            offset = " ".join(f"{part:.6f}" for part in offsets.get(name, [0.0] * 3))
-            lines += [f"{tab}JOINT {name}", f"{tab}{{", f"{tab}\tOFFSET {offset}",
-                      f"{tab}\tCHANNELS 3 {rotations}"]  # fmt: skip
-        tab = "\t" * (len(chain) + 1)
-        lines += [
-            f"{tab}End Site",
-            f"{tab}{{",
-            f"{tab}\tOFFSET 0.000000 0.000000 0.000000",
-            f"{tab}}}",
-        ]
-        lines += ["\t" * depth + "}" for depth in range(len(chain), 0, -1)]
-    return [*lines, "}"]
+        parent = 0
+        for name in chain:
+            x, y, z = (lengths.get(name, 0.0) * part for part in rests.get(name, (0.0, 0.0, 0.0)))
+            nodes.append(BvhNode(name, parent, (x, y, z)))
+            parent = len(nodes) - 1
+    return nodes
 
 
 _FRAMES_AT_A_TIME = 4096

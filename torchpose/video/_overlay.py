@@ -288,17 +288,20 @@ def draw_body(
     *,
     model: Bool[Tensor, "h w"] | None = None,
     silhouette: Bool[Tensor, "h w"] | None = None,
+    keypoints: Float[Tensor, "K 2"] | None = None,
     label: str = "",
 ) -> Image:
-    """Return a copy of a frame with a body, its silhouette and the measured outline drawn on it.
+    """Return a copy of a frame with a body, its silhouette and what was measured drawn on it.
 
     The person's left is blue, the right orange. The body's silhouette is a green tint, the outline
-    of what was measured yellow. Joints that are NaN or far outside are left out with their bones.
+    of what was measured yellow, as are the crosses of measured keypoints. Joints that are NaN or far
+    outside are left out with their bones.
 
     Args:
         image: [H, W, 3], RGB, uint8; not changed.
         joints2d: pixels of that image [J, 2]. skeleton: whose joints they are.
-        model, silhouette: of the image at any scale [h, w].
+        model, silhouette: of the image at any scale [h, w]. keypoints: pixels of that image, NaN where
+            there is none.
         label: a word or two over the head; ASCII.
 
     Returns:
@@ -321,6 +324,8 @@ def draw_body(
             pen.bone(points[parent], points[joint], colors[joint])
     for point, color in zip(points, colors, strict=True):
         pen.joint(point, color, True)
+    for point in [] if keypoints is None else keypoints.tolist():
+        pen.cross(point, _MEASURED)
     pen.label(label, points, skeleton.names.index("head") if "head" in skeleton.names else 0,
               _MIDDLE)  # fmt: skip
     return canvas

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
+from torchpose.camera._choice import is_padded
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import intrinsics
 from torchpose.camera._rig import scale_matrix, undistortion_maps
@@ -30,7 +31,6 @@ __all__ = [
     "read_silhouettes",
 ]
 
-_BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _PART = 0.03  # of the largest piece: smaller ones are no part of the person
 _HOLE = 0.02  # of the silhouette: larger holes are real, such as between arm and body
 _STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, of a static pixel
@@ -74,7 +74,7 @@ def fit_view(
     """
     calibrated = size if camera.image_size is None else camera.image_size
     padding = (calibrated[0] - size[0], calibrated[1] - size[1])
-    if not all(0 <= p < _BLOCK for p in padding):
+    if not is_padded(calibrated, size):
         raise CameraError(
             f"camera {camera.name!r} is calibrated for {calibrated[0]} x {calibrated[1]} pixels, and "
             f"its video has {size[0]} x {size[1]}: calibrate at the size of the video, or give a "

@@ -17,6 +17,7 @@ from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
+from torchpose.whole_body._body_files import BodyMotion3d, write_body_file
 from torchpose.whole_body._filters.body_particles import first_true
 
 __all__ = ["BodyTrack", "load_body", "repeat_last"]
@@ -39,6 +40,7 @@ _BODY = {
     "radii": "f L 2",
     "centres": "f P 3",
 }
+_FPS = 30.0  # of files that need a rate, where none is known
 _APART = 1e-3  # metres between joints and where the states put them
 _APART_OF = {"kalman": 0.3}  # whose joints shift, and whose bones adapt over time
 _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no person is outside
@@ -207,6 +209,32 @@ class BodyTrack:
                 f"{path}: expected {_DETAIL}actions of {len(self.action_names)} actions, got the sizes "
                 f"{list(actions.shape)}"
             )
+
+    def joints_std(self) -> Tensor:
+        """Return the standard deviation of every joint [T, J], metres, the mean of the three axes."""
+        variance = self.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1)
+        return variance.clamp_min(0).sqrt()
+
+    def export(self, path: str | Path, *, up: str | None = None) -> None:
+        """Write the poses for other programs: ``.trc`` (OpenSim), ``.c3d`` or ``.bvh``, by the suffix.
+
+        TRC and C3D hold `joints3d` as markers with the names of Pose2Sim (RHip, LKnee, CHip, ...), in
+        metres and in millimetres; the residuals of C3D are standard deviations. BVH holds the rigid body
+        that `state` turns, in centimetres. A frame rate that is not known is written as 30.
+
+        Args:
+            path: the file, which is replaced if there is one.
+            up: "z" or "y", the axis of the world that points up; the file then has y up. None keeps the
+                axes of the world.
+
+        Raises:
+            InputError: another suffix or axis. OutputError: the file cannot be written.
+        """
+        motion = BodyMotion3d(
+            self.body, self.state, self.joints3d, self.joints_std(), self.fps or _FPS,
+            self.first_frame,
+        )  # fmt: skip
+        write_body_file(path, motion, up)
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
         """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`.

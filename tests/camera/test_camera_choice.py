@@ -1,0 +1,40 @@
+"""Cameras for images of another size than the calibration's."""
+
+import pytest
+import torch
+
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.camera._choice import fit_to_size, is_padded
+from torchpose.errors import CameraError
+
+CAMERA = PinholeCamera(800, 810, 310, 250, 640, 480, "front", distortions=(0.1, -0.02),
+                       rotation=(0.1, 0.2, 0.3), translation=(0, 0, 3))  # fmt: skip
+
+
+def test_a_camera_is_scaled_as_a_rig_is():
+    fitted, notes = fit_to_size(CAMERA, (320, 240), "a.npz")
+    expected = CameraRig([CAMERA]).scaled(240, 320)
+    assert torch.allclose(fitted.matrix, expected.matrix[0])
+    assert fitted.image_size == (320, 240)
+    for name in ("distortions", "rotation", "translation", "name", "fisheye"):
+        before, after = getattr(CAMERA, name), getattr(fitted, name)
+        assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after
+    assert notes == (
+        "camera front is scaled from 640 x 480 pixels to the 320 x 240 pixels of a.npz",
+    )
+
+
+@pytest.mark.parametrize("size", [None, (640, 480), (632, 470)])
+def test_the_same_size_and_that_of_a_codec_change_nothing(size):
+    assert fit_to_size(CAMERA, size, "a.npz") == (CAMERA, ())
+
+
+def test_padding_is_less_than_a_block():
+    assert is_padded((1088, 1920), (1080, 1920))
+    assert not is_padded((1088, 1920), (1072, 1920))
+    assert not is_padded((1080, 1920), (1088, 1920))
+
+
+def test_images_of_another_shape_are_refused():
+    with pytest.raises(CameraError, match=r"a\.npz: is of 640 x 360 pixels, and camera 'front'"):
+        fit_to_size(CAMERA, (640, 360), "a.npz")

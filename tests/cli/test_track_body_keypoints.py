@@ -1,0 +1,288 @@
+"""`torchpose track-body` on keypoints: every kind of input, what is written, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.cli.test_track_body import HEIGHT, WIDTH, N, arms_rise, looking_at
+from torchpose.body import BODY_15, Body
+from torchpose.camera import CameraRig, load_cameras, save_cameras
+from torchpose.cli._body_keypoint_inputs import read_body_keypoints
+from torchpose.io import Keypoints, write_keypoints
+from torchpose.skeleton._joint_sets import SKELETONS
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
+from torchpose.video import VideoWriter
+from torchpose.whole_body import BodyTrack
+
+FPS = 50.0
+PLACES = {"front": (0.3, 3.2, 1.2), "left": (-3.0, 0.4, 1.4), "behind": (1.6, -2.7, 1.3)}
+OPENPOSE = SKELETONS["openpose-25"].joints
+IN_OPENPOSE = {"pelvis": "MidHip", "neck": "Neck"}
+DETECTOR = """
+import numpy as np
+
+POINTS = np.load({points!r})
+
+
+class front:
+    names = {names!r}
+
+    def __init__(self):
+        self.at = 0
+
+    def __call__(self, image):
+        self.at += 1
+        return POINTS[self.at - 1 : self.at], np.full((1, len(self.names)), 0.8)
+
+
+class nobody(front):
+    def __call__(self, image):
+        return np.zeros((0, len(self.names), 2)), np.zeros((0, len(self.names)))
+"""
+
+
+def openpose_name(joint: str) -> str:
+    side, _, kind = joint.rpartition("_")
+    return IN_OPENPOSE.get(joint, side[:1].upper() + kind.capitalize())
+
+
+def write_openpose(folder, points) -> None:
+    """The keypoints [T, 15, 2] of one person as OpenPose writes them, without the head."""
+    folder.mkdir()
+    table = np.zeros((len(points), len(OPENPOSE), 3))
+    for j, joint in enumerate(BODY_15.names):
+        if joint != "head":
+            table[:, OPENPOSE.index(openpose_name(joint)), :2] = points[:, j]
+            table[:, OPENPOSE.index(openpose_name(joint)), 2] = 0.9
+    for t, person in enumerate(table):
+        content = {"people": [{"pose_keypoints_2d": person.ravel().tolist()}]}
+        (folder / f"video_{t:012d}_keypoints.json").write_text(json.dumps(content))
+
+
+def keypoints_of(points, **more) -> Keypoints:
+    facts = {"fps": FPS, "image_size": (WIDTH, HEIGHT)} | more
+    return Keypoints(points, BODY_15.names, None, **facts)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A folder with cameras.toml, front_json/, left.csv and behind.npz, and the true joints [N, 15, 3]."""
+    folder = tmp_path_factory.mktemp("keypoints")
+    body = Body.of_height(BODY_15, 1.75)
+    joints = body.joints(arms_rise(body))
+    cameras = [looking_at(name, place) for name, place in PLACES.items()]
+    save_cameras(cameras, folder / "cameras.toml")
+    generator = torch.Generator().manual_seed(0)
+    points = CameraRig(cameras)(joints).pixels
+    points = points + 0.3 * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+    write_openpose(folder / "front_json", points[:, 0].numpy())
+    write_keypoints(folder / "left.csv", keypoints_of(points[:, 1]))
+    write_keypoints(folder / "behind.npz", keypoints_of(points[:, 2]))
+    write_keypoints(folder / "front.npz", keypoints_of(points[:, 0]))
+    for name in PLACES:
+        with VideoWriter(folder / f"{name}.mp4", FPS, (WIDTH, HEIGHT)) as writer:
+            for _ in range(N):
+                writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    np.save(folder / "points.npy", points[:, 0].numpy())
+    return folder, joints, points
+
+
+@pytest.fixture
+def track(torchpose, scene):
+    """The command on files of the scene: track("front_json", ..., "--option") -> Result."""
+    folder = scene[0]
+
+    def run(out, *words):
+        given = [folder / w if isinstance(w, str) and (folder / w).exists() else w for w in words]
+        return torchpose("track-body", folder / "cameras.toml", *given, "--out", out)
+
+    return run
+
+
+MIXED = ("front_json", "left.csv", "behind.npz")
+PLAIN = ("--pictures", "false")
+
+
+def apart(poses, joints) -> float:
+    return float((poses.joints3d - joints[: len(poses)]).norm(dim=-1).mean())
+
+
+def test_poses_from_all_kinds_of_files(track, scene, tmp_path):
+    out = tmp_path / "out"
+    formats = ("--formats", "trc", "c3d", "bvh", "--up", "z")
+    done = track(out, *MIXED, "--height", 1.75, "--smoothing", "full", *formats)
+    assert done.code == 0, done.err
+    assert "3 cameras, 50 fps" in done.out
+    assert "kalman, smoothed" in done.out
+    assert "front 9" in done.out  # per cent of its keypoints agree
+    names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert names == {"body.npz", "joints.csv", "body.trc", "body.c3d", "body.bvh", "skeleton.png",
+                     "report.html"}  # fmt: skip
+    poses = BodyTrack.load(out / "body.npz")
+    assert (len(poses), poses.fps, poses.method) == (N, FPS, "kalman")
+    assert apart(poses, scene[1]) < 0.03
+    rows = (out / "joints.csv").read_text().splitlines()
+    assert len(rows) == N + 1
+    assert rows[0].startswith("frame,pelvis_x,pelvis_y,pelvis_z,pelvis_std,")
+    # those of an earlier run that this one does not write are deleted
+    assert track(out, *MIXED, *PLAIN).code == 0
+    assert not (out / "body.trc").exists() and not (out / "skeleton.png").exists()
+
+
+def test_one_camera_is_enough(track, scene, tmp_path):
+    given = ("--camera-names", "[front]", "--height", 1.75, *PLAIN)
+    done = track(tmp_path, "front.npz", *given)
+    assert done.code == 0, done.err
+    assert len(BodyTrack.load(tmp_path / "body.npz")) == N
+    assert "m by its bones, 1.75 m given" in done.out
+
+
+def test_the_body_is_drawn_into_videos(track, scene, tmp_path):
+    videos = tuple(f"{name}.mp4" for name in PLACES)
+    done = track(tmp_path, "front_json", "left.csv", "behind.npz", "--videos", *videos)
+    assert done.code == 0, done.err
+    for name in ("overlay_front.mp4", "overlay_behind.mp4", "overlay.png", "skeleton.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+    assert "frame rate" not in done.out  # that of the other inputs
+
+
+def test_a_detector_finds_the_keypoints_in_videos(track, scene, tmp_path, monkeypatch):
+    folder, joints, _ = scene
+    text = DETECTOR.format(points=str(folder / "points.npy"), names=BODY_15.names)
+    (tmp_path / "body_detectors.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    mixed = ("front.mp4", "left.csv", "behind.npz", *PLAIN)
+    done = track(tmp_path / "a", *mixed, "--detector", "body_detectors:front")
+    assert done.code == 0, done.err
+    assert "by body_detectors:front" in done.out
+    assert not (tmp_path / "a" / "overlay_front.mp4").exists()  # the other cameras have no video
+    assert apart(BodyTrack.load(tmp_path / "a" / "body.npz"), joints) < 0.05
+    alone = ("front.mp4", "--camera-names", "[front]", *PLAIN)
+    done = track(tmp_path / "b", *alone, "--detector", "body_detectors:nobody")
+    assert done.code == 1
+    assert "no camera has a keypoint" in done.err
+    assert not (tmp_path / "b" / "body.npz").exists()
+
+
+def test_inputs_of_other_lengths_sizes_and_rates(track, scene, tmp_path):
+    points = scene[2]
+    write_keypoints(tmp_path / "short.npz", keypoints_of(points[:-2, 2]))
+    done = track(tmp_path / "a", "front_json", "left.csv", tmp_path / "short.npz", *PLAIN)
+    assert done.code == 0, done.err
+    assert f"have {N}, {N}, {N - 2} frames; the first {N - 2}" in done.out
+    assert len(BodyTrack.load(tmp_path / "a" / "body.npz")) == N - 2
+
+    half = keypoints_of((points[:, 2] + 0.5) / 2 - 0.5, image_size=(WIDTH // 2, HEIGHT // 2))
+    write_keypoints(tmp_path / "half.npz", half)
+    done = track(tmp_path / "b", "front_json", "left.csv", tmp_path / "half.npz", *PLAIN)
+    assert done.code == 0, done.err
+    assert f"scaled from {WIDTH} x {HEIGHT} pixels to the {WIDTH // 2} x {HEIGHT // 2}" in done.out
+    assert apart(BodyTrack.load(tmp_path / "b" / "body.npz"), scene[1]) < 0.05
+
+    write_keypoints(tmp_path / "slow.npz", keypoints_of(points[:, 2], fps=25.0))
+    slow = ("front_json", "left.csv", tmp_path / "slow.npz", *PLAIN)
+    done = track(tmp_path / "c", *slow)
+    assert (done.code, "one frame rate, got 25, 50 fps" in done.err) == (2, True)
+    done = track(tmp_path / "c", *slow, "--fps", 50)
+    assert (done.code, "25, 50 fps are taken at the given 50 fps" in done.out) == (0, True)
+
+
+def test_joint_sets_may_differ_between_cameras(track, scene, tmp_path):
+    """MediaPipe's landmarks have no neck and no pelvis; those of the prior over arms are not taken."""
+    points = scene[2]
+    marks = torch.full((N, len(LANDMARKS), 2), torch.nan, dtype=torch.float64)
+    for j, joint in enumerate(BODY_15.names):
+        if joint in LANDMARKS:
+            marks[:, LANDMARKS.index(joint)] = points[:, 1, j]
+    for ear, shift in (("left_ear", 2.0), ("right_ear", -2.0)):
+        marks[:, LANDMARKS.index(ear)] = points[:, 1, BODY_15.joint("head")] + shift
+    write_keypoints(tmp_path / "marks.npz", replace(keypoints_of(marks), names=LANDMARKS))
+    found = read_body_keypoints([str(tmp_path / "marks.npz")], [load_camera(scene)])
+    missing = torch.isnan(found.points[:, 0]).all(-1).all(0)
+    lacking = [name for name, gone in zip(BODY_15.names, missing, strict=True) if gone]
+    assert lacking == ["pelvis", "neck", "head"]
+    assert found.notes == ()
+    done = track(tmp_path / "out", "front_json", tmp_path / "marks.npz", "behind.npz", *PLAIN)
+    assert done.code == 0, done.err
+    assert apart(BodyTrack.load(tmp_path / "out" / "body.npz"), scene[1]) < 0.05
+
+
+def load_camera(scene):
+    return load_cameras(scene[0] / "cameras.toml")["left"]
+
+
+def test_delays_bring_cameras_in_step(track, scene, tmp_path):
+    points = scene[2]
+    late = torch.cat([points[:1, 1].expand(3, -1, -1), points[:, 1]])
+    write_keypoints(tmp_path / "late.npz", keypoints_of(late))
+    given = ("front_json", tmp_path / "late.npz", "behind.npz", *PLAIN)
+    done = track(tmp_path / "a", *given, "--delays", "[0,3,0]")
+    assert done.code == 0, done.err
+    assert "frames; the first" not in done.out
+    assert apart(BodyTrack.load(tmp_path / "a" / "body.npz"), scene[1]) < 0.05
+    for delays in ("[0,11,0]", "[0,-1,0]"):
+        done = track(tmp_path / "b", *given, "--delays", delays)
+        assert (done.code, "from 0 to below the number of frames" in done.err) == (2, True)
+
+
+def test_an_unknown_rate_is_said(track, tmp_path):
+    done = track(tmp_path, "front_json", "--camera-names", "[front]", "--height", 1.75, *PLAIN)
+    assert (done.code, "no input states a frame rate: 30 fps assumed" in done.out) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("front_json", "left.csv"), "a camera for each of the 2 inputs"),
+        ((*MIXED, "--background", "a.png", "b.png", "c.png"), "--background is for silhouettes"),
+        ((*MIXED, "--manifold", "walk"), "--manifold is for silhouettes"),
+        ((*MIXED, "--n-particles", 300), "--n-particles is for silhouettes"),
+        ((*MIXED, "--facing", "[1,0,0]"), "--facing is for silhouettes"),
+        ((*MIXED, "--method", "apf"), "--method apf takes silhouettes of videos"),
+        ((*MIXED, "--detector", "a.onnx"), "all inputs are keypoints"),
+        ((*MIXED, "--min-confidence", 0.5), "--min-confidence is for --detector"),
+        ((*MIXED, "--videos", "front.mp4"), "--videos needs one entry for each of the 3"),
+        ((*MIXED, "--delays", "[1]"), "--delays needs one entry for each of the 3"),
+        ((*MIXED, "--formats", "fbx"), "--formats must be one of trc, c3d, bvh"),
+        ((*MIXED, "--up", "z"), "--up is for the files of --formats"),
+        ((*MIXED, "--smoothing", "5"), "--smoothing must be one of none, full"),
+        ((*MIXED, "--keypoint-std", -1), "--keypoint-std must be positive"),
+        (("front.mp4", "left.csv", "behind.npz"), "--detector finds the keypoints in videos"),
+        (("gone", "left.csv", "behind.npz"), "and is not there"),
+        (("front.mp4", "left.mp4", "behind.mp4", "--method", "kalman"), "takes keypoints"),
+        (("front.mp4", "left.mp4", "behind.mp4", "--smoothing", "full"), "is for keypoints"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(track, tmp_path, words, said):
+    done = track(tmp_path / "out", *words)
+    assert done.code == 2 and said in done.err, done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_bad_files_are_refused(track, torchpose, scene, tmp_path):
+    folder, _, points = scene
+    (tmp_path / "empty").mkdir()
+    done = track(tmp_path / "out", tmp_path / "empty", "left.csv", "behind.npz")
+    assert (done.code, "the folder is empty" in done.err) == (2, True)
+
+    wide = keypoints_of(points[:, 2], image_size=(2 * WIDTH, HEIGHT))
+    write_keypoints(tmp_path / "wide.npz", wide)
+    done = track(tmp_path / "out", "front_json", "left.csv", tmp_path / "wide.npz")
+    assert (done.code, "images of another shape are cut" in done.err) == (2, True)
+
+    arms = replace(keypoints_of(points[:, 2, :6]), names=BODY_15.names[:6])
+    write_keypoints(tmp_path / "arms.npz", arms)
+    done = track(tmp_path / "out", "front_json", "left.csv", tmp_path / "arms.npz")
+    assert (done.code, "arms.npz: a whole body needs shoulders and hips" in done.err) == (2, True)
+
+    cameras = list(load_cameras(folder / "cameras.toml").values())
+    for camera in cameras:
+        camera.translation *= 1000
+    save_cameras(cameras, tmp_path / "millimetres.toml")
+    done = torchpose("track-body", tmp_path / "millimetres.toml", *(folder / m for m in MIXED),
+                     "--out", tmp_path / "out")  # fmt: skip
+    assert (done.code, "cameras must be given in metres" in done.err) == (2, True)
+    assert not (tmp_path / "out" / "body.npz").exists()

@@ -1,0 +1,256 @@
+"""Read the keypoints of a body in calibrated cameras: from files, or by a detector in videos."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose._core.terminal import show_progress
+from torchpose.cli._track import is_video
+from torchpose.errors import InputError, SkeletonError
+from torchpose.skeleton._mediapipe_landmarks import count_given
+
+if TYPE_CHECKING:
+    from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.measure._keypoint_measurer import FrameKeypoints, KeypointMeasurer
+    from torchpose.video._source_interface import VideoSource
+
+__all__ = [
+    "BodyKeypoints",
+    "DetectorSettings",
+    "are_keypoints",
+    "common_rate",
+    "read_body_keypoints",
+]
+
+_FPS = 30.0
+_SAME_RATE = 3  # digits
+
+
+class DetectorSettings(NamedTuple):
+    """Holds what finds keypoints in videos.
+
+    Attributes:
+        where: file of a model, or package:factory. min_confidence: of a keypoint, None for the usual one.
+    """
+
+    where: str
+    min_confidence: float | None
+
+
+class CameraKeypoints(NamedTuple):
+    """Holds the keypoints of one camera.
+
+    Attributes:
+        points: of the joints of `BODY_15` [T, 15, 2], pixels, NaN where missing.
+        confidence: [T, 15]. fps, size: of the images, (width, height), None if unknown. notes: of the reader.
+    """
+
+    points: Tensor
+    confidence: Tensor
+    fps: float | None
+    size: tuple[int, int] | None
+    notes: tuple[str, ...] = ()
+
+
+class BodyKeypoints(NamedTuple):
+    """Holds the keypoints of all cameras, in step.
+
+    Attributes:
+        points: of the joints of `BODY_15` [T, C, 15, 2], pixels, NaN where missing.
+        confidence: [T, C, 15]. cameras: for the images in which the keypoints are.
+        fps: frames per second. notes: on what was assumed.
+    """
+
+    points: Tensor
+    confidence: Tensor
+    cameras: "list[PinholeCamera]"
+    fps: float
+    notes: tuple[str, ...]
+
+
+def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
+    """Return whether a body is tracked by keypoints: those of files, or of a detector.
+
+    Raises:
+        InputError: an input that is not there, an empty folder, keypoints beside videos without a detector,
+            or a detector without videos.
+    """
+    for path in map(Path, inputs):
+        if path.is_dir() and not any(path.iterdir()):
+            raise InputError(
+                f"{path}: expected OpenPose JSON files or images, but the folder is empty"
+            )
+    videos = [path for path in inputs if is_video(path)]
+    if detector is not None and not videos:
+        raise InputError("--detector finds keypoints in videos, and all inputs are keypoints")
+    if detector is None and 0 < len(videos) < len(inputs):
+        missing = "" if Path(videos[0]).exists() else ", and is not there"
+        raise InputError(
+            f"{videos[0]} is taken for a video{missing}, and others for keypoints; --detector finds the "
+            "keypoints in videos"
+        )
+    return detector is not None or not videos
+
+
+def read_body_keypoints(
+    inputs: Sequence[str],
+    cameras: "Sequence[PinholeCamera]",
+    *,
+    detector: DetectorSettings | None = None,
+    fps: float | None = None,
+    delays: Sequence[int] | None = None,
+    other_rates: Sequence[float] = (),
+) -> BodyKeypoints:
+    """Read the keypoints of all cameras and bring them in step.
+
+    Args:
+        inputs: for each camera a file or folder of keypoints, or with a detector a video.
+        cameras: calibrated, in the same order. detector: of the keypoints in videos.
+        fps: of all inputs. delays: frames by which each began too early.
+        other_rates: of videos of the same recording, which count where no input states a rate.
+
+    Raises:
+        InputError, FileFormatError, SkeletonError: inputs that cannot be read, different frame rates.
+        CameraError: images of another shape than the camera's.
+    """
+    from torchpose.camera._choice import fit_to_size
+
+    parts = [_read(path, detector, fps) for path in inputs]
+    fitted = [
+        fit_to_size(camera, part.size, path)
+        for camera, part, path in zip(cameras, parts, inputs, strict=True)
+    ]
+    rates = [part.fps for part in parts if part.fps is not None] or list(other_rates)
+    rate, notes = common_rate(rates, fps)
+    points, confidence, more = _in_step(parts, delays or [0] * len(parts), inputs)
+    notes += more + tuple(note for _, found in fitted for note in found)
+    notes += tuple(
+        f"{path}: {n}" for path, part in zip(inputs, parts, strict=True) for n in part.notes
+    )
+    return BodyKeypoints(points, confidence, [camera for camera, _ in fitted], rate, notes)
+
+
+def common_rate(rates: Sequence[float], given: float | None) -> tuple[float, tuple[str, ...]]:
+    """Return the frame rate of all inputs, and a note where it is not what they say.
+
+    Raises:
+        InputError: different rates, and none given.
+    """
+    known = sorted({round(rate, _SAME_RATE) for rate in rates})
+    said = ", ".join(f"{rate:g}" for rate in known)
+    if given is not None:
+        other = any(abs(rate - given) > 10**-_SAME_RATE for rate in known)
+        return given, (f"inputs of {said} fps are taken at the given {given:g} fps",) * other
+    if len(known) > 1:
+        raise InputError(
+            f"the inputs must have one frame rate, got {said} fps; bring them to one rate, or give that "
+            "of all by --fps"
+        )
+    if not known:
+        return _FPS, (f"no input states a frame rate: {_FPS:g} fps assumed, --fps says another",)
+    return rates[0], ()
+
+
+def _in_step(
+    parts: Sequence[CameraKeypoints], delays: Sequence[int], inputs: Sequence[str]
+) -> tuple[Tensor, Tensor, tuple[str, ...]]:
+    """Return keypoints and confidence of the frames that all cameras have, and a note on the others."""
+    lengths = [len(part.points) - delay for part, delay in zip(parts, delays, strict=True)]
+    if min(delays) < 0 or min(lengths) < 1:
+        worst = lengths.index(min(lengths)) if min(delays) >= 0 else delays.index(min(delays))
+        raise InputError(
+            f"--delays must be from 0 to below the number of frames, got {delays[worst]} for "
+            f"{inputs[worst]}, which has {len(parts[worst].points)}"
+        )
+    n = min(lengths)
+    rows = [slice(delay, delay + n) for delay in delays]
+    points = torch.stack([p.points[r] for p, r in zip(parts, rows, strict=True)], 1)
+    confidence = torch.stack([p.confidence[r] for p, r in zip(parts, rows, strict=True)], 1)
+    shown = ", ".join(map(str, lengths))
+    note = f"the inputs have {shown} frames; the first {n} of each are used"
+    return points, confidence, (note,) * (len(set(lengths)) > 1)
+
+
+# --- one camera -----------------------------------------------------------------------------------
+
+
+def _read(path: str, detector: DetectorSettings | None, fps: float | None) -> CameraKeypoints:
+    if detector is not None and is_video(path):
+        return _detect(path, detector, fps)
+    from torchpose.io._keypoints import read_keypoints
+
+    found = read_keypoints(path)
+    points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
+    notes = found.notes if count_given(found.names) == len(found.names) else ()
+    return CameraKeypoints(points, confidence, found.fps, found.image_size, notes)
+
+
+def _of_body(
+    source: str, points: Tensor, confidence: Tensor | None, names: Sequence[str]
+) -> tuple[Tensor, Tensor]:
+    """Return keypoints [T, 15, 2] and confidence [T, 15] of the joints of `BODY_15`.
+
+    Heads and necks that were put where the prior of the upper body has them are none of this body.
+    """
+    from torchpose.body._skeleton import body_joints
+
+    there = torch.isfinite(points).all(-1)
+    trust = there.to(points) if confidence is None else confidence.to(points)
+    given = count_given(names)
+    table = torch.cat([points, trust[..., None]], -1)[..., :given, :]
+    try:
+        joints = body_joints(table, names[:given], middles=False)
+    except SkeletonError as error:
+        raise SkeletonError(f"{source}: {error}") from error
+    return joints[..., :2], joints[..., 2].nan_to_num(0.0)
+
+
+def _detect(path: str, settings: DetectorSettings, fps: float | None) -> CameraKeypoints:
+    """Find the keypoints of the person whom most frames of a video show."""
+    from torchpose.video._source import open_video
+
+    with open_video(path, fps=fps) as source:
+        measurer = _measurer(settings, source.fps)
+        frames = list(_measured(measurer, source))
+        person, notes = _most_seen(frames)
+        points = torch.full((len(frames), len(measurer.names), 2), torch.nan, dtype=torch.float64)
+        confidence = torch.zeros(points.shape[:2], dtype=torch.float64)
+        for t, frame in enumerate(frames):
+            for row in (frame.person == person).nonzero().flatten().tolist():
+                points[t], confidence[t] = frame.keypoints[row], frame.confidence[row]
+        points, confidence = _of_body(settings.where, points, confidence, measurer.names)
+        return CameraKeypoints(points, confidence, source.fps, source.size, (*source.notes, *notes))
+
+
+def _measurer(settings: DetectorSettings, fps: float) -> "KeypointMeasurer":
+    from torchpose.measure._detectors.load import load_detector
+    from torchpose.measure._keypoint_measurer import LEAST_CONFIDENCE, KeypointMeasurer
+
+    least = LEAST_CONFIDENCE if settings.min_confidence is None else settings.min_confidence
+    found = load_detector(settings.where, fps)
+    return KeypointMeasurer(found, fps, min_confidence=least, name=settings.where)
+
+
+def _measured(measurer: "KeypointMeasurer", source: "VideoSource") -> "Iterator[FrameKeypoints]":
+    from tqdm.auto import tqdm
+
+    bar: Any = tqdm(source, total=source.n_frames, disable=not show_progress(), unit="frame",
+                    desc=f"keypoints of {Path(source.name).name}")  # fmt: skip
+    state = measurer.init()
+    for frame in bar:
+        state, found = measurer.step(state, frame.image)
+        yield found
+
+
+def _most_seen(frames: "Sequence[FrameKeypoints]") -> tuple[int, tuple[str, ...]]:
+    """Return the number of the person in most frames, -1 if there is none, and a note on others."""
+    seen = Counter(number for frame in frames for number in frame.person.tolist())
+    if not seen:
+        return -1, ("the detector found nobody",)
+    person, count = seen.most_common(1)[0]
+    note = f"of {len(seen)} persons the one in most frames ({count} of {len(frames)}) is tracked"
+    return person, (note,) * (len(seen) > 1)
