@@ -377,7 +377,7 @@ _NEEDED = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
 def body_joints(
-    joints: Float[Tensor, "*batch K C"], names: Sequence[str], *, middles: bool = True
+    joints: Float[Tensor, "*batch K C"], names: Sequence[str]
 ) -> Float[Tensor, "*batch 15 C"]:
     """Pick the joints of `BODY_15` out of a joint set.
 
@@ -390,7 +390,6 @@ def body_joints(
     Args:
         joints: [..., K, C], metres (C = 3) or pixels (C = 2), in any axes.
         names: the K names.
-        middles: whether the middle of hips or shoulders stands for a pelvis or neck that the set lacks.
 
     Returns:
         [..., 15, C] in the order of `BODY_15`, NaN where the set lacks a joint.
@@ -411,7 +410,7 @@ def body_joints(
     unknown = torch.full_like(joints[..., 0, :], torch.nan)
     picked = [unknown if i is None else joints[..., i, :] for i in found]
     for joint, (left, right) in _MIDDLES.items():
-        if middles and found[BODY_15.joint(joint)] is None:
+        if found[BODY_15.joint(joint)] is None:
             both = picked[BODY_15.joint(left)], picked[BODY_15.joint(right)]
             picked[BODY_15.joint(joint)] = (both[0] + both[1]) / 2
     return torch.stack(picked, -2)

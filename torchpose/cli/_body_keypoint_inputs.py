@@ -203,7 +203,7 @@ def _of_body(
     given = count_given(names)
     table = torch.cat([points, trust[..., None]], -1)[..., :given, :]
     try:
-        joints = body_joints(table, names[:given], middles=False)
+        joints = body_joints(table, names[:given])
     except SkeletonError as error:
         raise SkeletonError(f"{source}: {error}") from error
     return joints[..., :2], joints[..., 2].nan_to_num(0.0)

@@ -68,10 +68,10 @@ class BodyTracker(nn.Module):
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
 
-    ``kalman`` takes the keypoints of any detector in one camera or more: an iterated extended Kalman filter
-    over root, rotations, their velocities and bone lengths, in which every keypoint is its joint's, that of the
-    other side, or nobody's (docs/keypoint-bodies.md). The other methods take silhouettes, and are particle
-    filters:
+    ``kalman`` takes the keypoints of any detector in one camera or more. It is an iterated extended Kalman
+    filter over root, rotations, their velocities and bone lengths, in which every keypoint is its joint's,
+    that of the other side, or nobody's (docs/keypoint-bodies.md). The other methods take silhouettes, and are
+    particle filters:
 
     - ``mrpf``: also weighted by the distance from a manifold of poses of the same action
       (`ManifoldParticleFilter`); needs `manifold`.
@@ -88,7 +88,8 @@ class BodyTracker(nn.Module):
             else "apf".
         body: the person's body, or a body.npz (`BodyTrack`) whose bone lengths and shape the person has;
             then the height is not used.
-        height: the height of the person, metres; by default 1.75 with silhouettes, and estimated from keypoints.
+        height: the height of the person, metres; by default 1.75 with silhouettes, and estimated from
+            keypoints.
         manifold: the poses of an action, by a name that `torchpose info` lists, or a file; in Python also
             the model itself. Every method finds the first pose with it.
         conditionals: the rotations of limbs relative to each other and over time, by name, or a file.
@@ -155,8 +156,7 @@ class BodyTracker(nn.Module):
         given = {"manifold": manifold, "conditionals": conditionals, "action": action}
         given = {kind: value for kind, value in given.items() if value is not None}
         self.by_keypoints: KeypointBodyTracker | None = None
-        noises = {"keypoint_std": keypoint_std, "pixel_std": pixel_std}
-        noises = {name: value for name, value in noises.items() if value is not None}
+        self.notes: tuple[str, ...] = ()
         if method == KEYPOINT_METHOD:
             unused = [*given, *options]
             unused += ["process_cov"] * (process_cov is not None)
@@ -169,13 +169,13 @@ class BodyTracker(nn.Module):
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.by_keypoints = KeypointBodyTracker(
                 as_rig(cameras), fps, body=person, height=height,
-                options=KeypointOptions(**noises),
+                options=KeypointOptions(keypoint_std, 1.0 if pixel_std is None else pixel_std),
             )  # fmt: skip
-            self.cameras, self.n_particles, self.notes = self.by_keypoints.rig, 0, ()
+            self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return
-        if noises:
+        if keypoint_std is not None or pixel_std is not None:
             raise InputError(
-                f"{', '.join(noises)} does nothing without method={KEYPOINT_METHOD!r}, which takes keypoints"
+                f"keypoint_std and pixel_std do nothing without method={KEYPOINT_METHOD!r}"
             )
         height = _HEIGHT if height is None else height
         self.method = choose_method(method, given)
@@ -253,7 +253,7 @@ class BodyTracker(nn.Module):
         n_frames: int | None = None,
         progress: bool = False,
     ) -> BodyTrack | list[BodyTrack]:
-        """Track one person from the first frame whose silhouettes all show a person, or from the first keypoints.
+        """Track one person from the first frame whose silhouettes all show a person, or that has keypoints.
 
         Args:
             keypoints: [T, C, J, 2] or [B, T, C, J, 2], pixels as detected, NaN where there is none; for
@@ -276,8 +276,8 @@ class BodyTracker(nn.Module):
             `BodyTrack`, from frame `first_frame`; of keypoints [B, T, ...] a list of B.
 
         Raises:
-            NobodySeenError: by all cameras in any frame, or no keypoint. InputError: silhouettes that are not bool, or
-            lengths outside 1..T.
+            NobodySeenError: by all cameras in any frame, or no keypoint. InputError: silhouettes that are not
+            bool, or lengths outside 1..T.
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
@@ -393,6 +393,8 @@ class BodyTracker(nn.Module):
             return self.advance(state, [silhouettes])
         if keypoints is None:
             raise InputError(f"method {self.method} takes keypoints, got none")
+        if isinstance(state.filter, BodyFilterState):
+            raise InputError(f"expected the state of a tracker with method {self.method}")
         after, pose = self.by_keypoints.step(
             state.filter, keypoints, confidence, names, covariance=covariance
         )
@@ -414,7 +416,7 @@ class BodyTracker(nn.Module):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
-        if self.by_keypoints is not None:
+        if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         after, poses = follow(
             self.filter, state.filter, silhouettes, self.cameras, state.generator, state.frame

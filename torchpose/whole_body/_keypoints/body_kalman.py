@@ -216,7 +216,8 @@ class BodyKalmanFilter(nn.Module):
         found: _Linearised | None = None,
     ) -> CorrectedBody:
         """Return the posterior after steps of Gauss and Newton, the first from what was found already."""
-        point, d, joint_cov = state.mean, torch.zeros_like(state.cov[..., 0]), None
+        point, d = state.mean, torch.zeros_like(state.cov[..., 0])
+        joint_cov: Tensor | None = None
         for width in widths:
             if found is None:
                 found = self._linearised(state, point, frame, joint_cov, width)
@@ -225,6 +226,7 @@ class BodyKalmanFilter(nn.Module):
             point = self.articulation.moved(state.mean, d)
             UH = step.U @ found.H.mT
             joint_cov, G, found = _blocks(found.G - UH.mT @ UH), found.G, None
+        assert joint_cov is not None  # there is a step at least
         return self._corrected(state, frame, point, joint_cov, step, G)
 
     def _linearised(

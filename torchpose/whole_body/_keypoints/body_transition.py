@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._body_motion import BodyMotion
 
-__all__ = ["Transition", "jump_variance", "transition"]
+__all__ = ["BodyTransition", "jump_variance", "transition"]
 
 _SCALE_DRIFT = 0.002  # of the log of a bone's length, per root of a second
 _EXCHANGES = 0.1  # per second and camera, sides begin to be exchanged
@@ -22,7 +22,7 @@ _JUMPS = {"position": 0.1, "rotations": 0.7, "velocity": 5.0, "shifts": 0.05}
 _ROOT_JUMP = 1.0  # metres per second
 
 
-class Transition(NamedTuple):
+class BodyTransition(NamedTuple):
     """Holds the model of one frame.
 
     Attributes:
@@ -55,7 +55,7 @@ class Transition(NamedTuple):
         return torch.logit(_STAYS_LOST * doubt.sigmoid() + self.lost, _ODDS)
 
 
-def transition(motion: BodyMotion, dt: float) -> Transition:
+def transition(motion: BodyMotion, dt: float) -> BodyTransition:
     """Return the model of a frame of dt seconds.
 
     Position and angles: x' = x + (1 - a) / decay v,  v' = a v,  a = exp(-decay dt), with the noise of white
@@ -82,7 +82,7 @@ def transition(motion: BodyMotion, dt: float) -> Transition:
     begin, end, lost = (1 - math.exp(-rate * dt) for rate in (_EXCHANGES, _RETURNS, _LOST))
     device = motion.acceleration.device
     share = dt / float(motion.pull_time)
-    return Transition(matrix.to(device), noise.to(device), share, begin, end, lost)
+    return BodyTransition(matrix.to(device), noise.to(device), share, begin, end, lost)
 
 
 def jump_variance(motion: BodyMotion) -> Float[Tensor, " N"]:

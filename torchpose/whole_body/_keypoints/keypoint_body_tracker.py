@@ -1,7 +1,7 @@
 """Track one person or several recordings through keypoints of calibrated cameras, to `BodyTrack`."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -173,7 +173,7 @@ class KeypointBodyTracker(nn.Module):
         there = torch.isfinite(points).all(-1) & (trust > 0)
         inlier = torch.where(there, trust.clamp(*_INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
-        table = body_joints(table, names, middles=False)
+        table = body_joints(table, names)
         pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
         self._check_inside(pixels)
         pixels = self.rig.undistort_points(pixels).nan_to_num()
@@ -218,7 +218,6 @@ class KeypointBodyTracker(nn.Module):
         rigid = _rigid_body(bones)
         state = rigid.state_of(point.position, body.world_rotations(point))
         frame = KeypointFrame(*(value[b] for value in frames))
-        nobody = ~poses.coasting[b]
         return BodyTrack(
             rigid,
             state,
@@ -228,7 +227,7 @@ class KeypointBodyTracker(nn.Module):
             poses.log_evidence[b],
             torch.full_like(poses.log_evidence[b], torch.nan),
             poses.coasting[b],
-            poses.started[b] & (torch.arange(len(nobody), device=nobody.device) > 0) & summed_up,
+            poses.started[b] & (poses.started[b].cumsum(0) > 1),
             self.fps,
             notes=self._notes(poses, frame, b) if summed_up else (),
             details={
@@ -266,7 +265,7 @@ def _rigid_body(bones: Float[Tensor, "T J 3"]) -> Body:
 
 def _with_time(pose: KeypointPoses) -> KeypointPoses:
     """Return the poses of one frame as those of a sequence of one."""
-    point = pose.point.map(lambda value: value[:, None])
-    return KeypointPoses(
-        *(point if name == "point" else getattr(pose, name)[:, None] for name in pose._fields)
-    )
+    fields: dict[str, Any] = {
+        name: value[:, None] for name, value in pose._asdict().items() if name != "point"
+    }
+    return KeypointPoses(point=pose.point.map(lambda value: value[:, None]), **fields)

@@ -5,17 +5,17 @@ anywhere in an area a:
 
     p(z | x) = pi N(z; h_c(p_j(x)), R) + (1 - pi) / a.
 
-The noise has a part in pixels and one that a detector makes relative to the body, whose size in the image goes
-with the depth: R = s_c (r + m f^2 / depth^2) I, with a factor s_c of the camera that the filter estimates. In each
-camera left and right of the arms, and of the legs, may be exchanged; whether they are is a two-state chain over
-time. All of it is marginalised: expected information about joints is what the filter gets.
+The noise has a part in pixels, and one that is relative to the body, whose size in the image goes with the
+depth: R = s_c (r + m f^2 / depth^2) I, with a factor s_c of the camera that the filter estimates. In each
+camera left and right of the arms, and of the legs, may be exchanged. Whether they are is a two-state chain
+over time. All of it is marginalised: the filter gets expected information about joints.
 """
 
 import math
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.body._skeleton import BodySkeleton, other_side
@@ -53,7 +53,7 @@ class RigMaps(NamedTuple):
 
     @classmethod
     def of(cls, rig: CameraRig) -> Self:
-        """Return the maps of a rig; outliers lie in a quarter of the image, as large as the person's surroundings."""
+        """Return the maps of a rig; outliers lie in a quarter of the image, around the person."""
         shift = (rig.matrix @ rig.translation[..., None]).squeeze(-1)
         focal = rig.matrix[:, 0, 0] * rig.matrix[:, 1, 1]
         areas = [
@@ -113,8 +113,8 @@ class Weighed(NamedTuple):
     """Holds expected weights of the two readings of every keypoint.
 
     Attributes:
-        own, other: [B, C, J], probability that the keypoint is of its joint and an inlier; that the keypoint of
-            the other side is of this joint and an inlier.
+        own, other: [B, C, J], probability that the keypoint is of its joint and an inlier; that the keypoint
+            of the other side is of this joint and an inlier.
         variance, other_variance: [B, C, J], of the noise of both.
         exchanged: [B, C, 2], probability that sides of arms and of legs are exchanged.
         log_joint: [B, C, J], log density of the keypoints that would be of the joint, 0 where there is none.
@@ -247,8 +247,3 @@ def squared_errors(
     spread = (seen.by_joint @ joint_cov.unsqueeze(-4) * seen.by_joint).sum((-2, -1))
     square = (frame.pixels - seen.pixels).square().sum(-1) + spread
     return (weighed.own * square / weighed.variance).sum(-1), 2 * weighed.own.sum(-1)
-
-
-def measured(weighed: Weighed) -> Bool[Tensor, "B C J"]:
-    """Return which joints have a keypoint that is likely theirs."""
-    return weighed.own + weighed.other > 0.5

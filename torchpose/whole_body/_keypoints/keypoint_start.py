@@ -1,8 +1,8 @@
 """Find the state in which a body begins: from the keypoints of one frame, without a guess.
 
-Joints are triangulated by the cameras that agree on them, or put at the depth at which a person has the image's
-size where there is one camera. They tell where the trunk is and its axis. The filter's own correction then begins
-at several headings, with noise that is wide at first; evidence tells which heading is right.
+Joints are triangulated by the cameras that agree on them. Where there is one camera, they are put at the
+depth at which a person has the image's size. They tell where the trunk is and its axis. The filter's own
+correction then begins at several headings, with noise that is wide at first. Evidence tells which is right.
 """
 
 import math
@@ -66,12 +66,13 @@ class Start(NamedTuple):
 def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
     """Return the likeliest hypotheses of a start.
 
-    Several cameras see the pose, so that it is corrected from limbs along triangulated bones, at several headings. One
-    camera does not: there every component of the pose prior is a hypothesis of its own, and the best heading of
-    each is kept.
+    Several cameras see the pose, so it is corrected from limbs along triangulated bones, at several headings.
+    One camera does not: there every component of the pose prior is a hypothesis of its own, and the best
+    heading of each is kept.
 
     Args:
-        filter: that tracks on. frame: the first keypoints, of B persons. count: of hypotheses for each, at most.
+        filter: that tracks on. frame: the first keypoints, of B persons.
+        count: of hypotheses for each person, at most.
     """
     maps, body, motion = filter.maps, filter.articulation, filter.motion
     if len(maps.shift) > 1:
@@ -100,7 +101,7 @@ def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
 
 
 def _state(points: BodyPoint, covs: Float[Tensor, "#B N N"], maps: RigMaps) -> BodyGaussian:
-    """Return Gaussians about points, which take the covariances in turn; nothing is known of the cameras."""
+    """Return Gaussians about points that take the covariances in turn; nothing is known of cameras."""
     count, n_cameras = len(points.position), len(maps.shift)
     new = points.position.new_full
     return BodyGaussian(
@@ -135,8 +136,8 @@ def _posed_covs(motion: BodyMotion) -> Float[Tensor, "K N N"]:
 def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
     """Return joints by the cameras that agree, NaN where no two do.
 
-    The pair of cameras that most others agree with decides; all that agree then count (linear least squares of
-    u (M p + m)_3 = (M p + m)_12).
+    The pair of cameras that most others agree with decides; all that agree then count, by linear least
+    squares of u (M p + m)_3 = (M p + m)_12.
     """
     rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
     right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
@@ -224,7 +225,7 @@ def _points(
 def _leftwards(
     articulation: Articulation, joints: Float[Tensor, "B J 3"], up: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B 3"]:
-    """Return the direction from right to left shoulder and hip, across an axis; any where they are not known."""
+    """Return the direction from right to left across an axis, any where shoulders and hips are not known."""
     left, right = (
         torch.stack([joints[:, articulation.skeleton.joint(f"{side}_{name}")] for name in _SIDED])
         for side in ("left", "right")

@@ -34,13 +34,14 @@ class KeypointStream(NamedTuple):
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
         begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
-            been of something else.
+            been of something else. best: [B], the likeliest hypothesis.
     """
 
     state: BodyGaussian
     log_weights: Tensor
     begun: Tensor
     lost: Tensor
+    best: Tensor
 
 
 class KeypointPoses(NamedTuple):
@@ -49,9 +50,9 @@ class KeypointPoses(NamedTuple):
     Attributes:
         joints: [..., J, 3], metres, world axes. covariance: [..., J, 3, 3], metres squared.
         point: the states, on the manifold. state_cov: [..., N, N], in their tangent spaces.
-        inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of arms,
-            legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...], where
-            tracking began.
+        inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of
+            arms, of legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...],
+            where tracking began.
     """
 
     joints: Tensor
@@ -88,14 +89,18 @@ class KeypointTracker(nn.Module):
             frames: [B, T, C, J, ...]. smoothing: whether later frames count too. progress: show a bar.
         """
         n_frames = frames.pixels.shape[1]
-        stream, poses, corrected = None, [], []
+        stream, poses, corrected, joined = None, [], [], []
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
             frame = KeypointFrame(*(value[:, t] for value in frames))
+            before: KeypointStream | None = stream
             stream, pose, found = self.advance(stream, frame)
             poses.append(pose)
-            corrected.append(found)
+            if smoothing:
+                corrected.append(found)
+                other = pose.started if before is None else stream.best != before.best
+                joined.append(pose.started | other)
         filtered = _stacked(poses)
-        return self._smoothed(filtered, corrected) if smoothing else filtered
+        return self._smoothed(filtered, corrected, torch.stack(joined)) if smoothing else filtered
 
     def advance(
         self, stream: KeypointStream | None, frame: KeypointFrame
@@ -116,8 +121,8 @@ class KeypointTracker(nn.Module):
             due = enough & (~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps))
             if bool(due.any()):
                 stream, found = self._begun_anew(stream, found, frame, due)
-        best = self._best(stream)
-        chosen = found.take(best)
+        stream = stream._replace(best=stream.log_weights.argmax(-1))
+        chosen = found.take(self._rows(stream))
         inlier = chosen.weighed.own + chosen.weighed.other
         stream = stream._replace(lost=self._lost(stream, frame, chosen.weighed))
         pose = KeypointPoses(
@@ -146,7 +151,8 @@ class KeypointTracker(nn.Module):
         count = len(weights)
         zero = weights.new_zeros(count)
         begun = torch.ones(count, dtype=torch.bool, device=weights.device)
-        return KeypointStream(found.state, weights - weights[:, :1], begun, zero), found
+        best = torch.zeros_like(begun, dtype=torch.long)
+        return KeypointStream(found.state, weights - weights[:, :1], begun, zero, best), found
 
     def _begun_anew(
         self,
@@ -165,13 +171,14 @@ class KeypointTracker(nn.Module):
             stream.log_weights.index_copy(0, persons, new.log_weights),
             stream.begun | due,
             torch.where(due, 0.0, stream.lost),
+            stream.best,
         )
         return stream, found.put(rows, new_found)
 
-    def _best(self, stream: KeypointStream) -> Int[Tensor, " B"]:
+    def _rows(self, stream: KeypointStream) -> Int[Tensor, " B"]:
+        """Return the rows of the likeliest hypotheses."""
         count, n_each = stream.log_weights.shape
-        first = torch.arange(count, device=stream.log_weights.device) * n_each
-        return first + stream.log_weights.argmax(-1)
+        return torch.arange(count, device=stream.best.device) * n_each + stream.best
 
     def _lost(
         self, stream: KeypointStream, frame: KeypointFrame, weighed: Weighed
@@ -190,11 +197,15 @@ class KeypointTracker(nn.Module):
     # --- whole sequences --------------------------------------------------------------------------
 
     def _smoothed(
-        self, filtered: KeypointPoses, corrected: Sequence[CorrectedBody]
+        self,
+        filtered: KeypointPoses,
+        corrected: Sequence[CorrectedBody],
+        joined: Bool[Tensor, "T B"],
     ) -> KeypointPoses:
+        """Return poses for which later frames count too, up to where another hypothesis took over."""
         widened = torch.stack([found.widened for found in corrected])
         states = [found.state for found in corrected]
-        result = smooth(self.filter, states, widened, filtered.started.mT)
+        result = smooth(self.filter, states, widened, joined)
         point = result.mean.map(lambda value: value.transpose(0, 1))
         cov = result.cov.transpose(0, 1)
         joints, jacobian = self.filter.articulation.linearise(point)

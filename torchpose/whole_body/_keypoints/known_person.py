@@ -31,7 +31,7 @@ def with_body(motion: BodyMotion, body: Body) -> BodyMotion:
 
 
 def with_height(motion: BodyMotion, height: float) -> BodyMotion:
-    """Return the prior of a person whose height is known: it tells the scale of the legs, and all that goes with it."""
+    """Return the prior of a person whose height is known, which tells the scale of the legs."""
     body = motion.articulation
     told = torch.tensor([name in ("knee", "ankle") for name in body.groups]).to(motion.scale_mean)
     told = told / told.sum()
