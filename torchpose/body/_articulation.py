@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body._kinematics import Body
@@ -235,6 +235,37 @@ class Articulation(nn.Module):
                     minimal_rotation(bone.expand_as(seen), seen)
                 )
         return point._replace(rotations=changed)
+
+    def swung(
+        self,
+        point: BodyPoint,
+        joints: Float[Tensor, "B J 3"],
+        known: Bool[Tensor, "B J"],
+    ) -> BodyPoint:
+        """Return points with limbs swung to bones that are known, without twist about their centres.
+
+        Args:
+            point: [B]. joints: metres, world axes.
+            known: whether a joint is known; a limb from a joint that is not begins where the point has it, and
+                one to such a joint stays as it is.
+        """
+        joints = torch.where(known[..., None], joints, self.joints(point))
+        rotations = point.rotations.clone()
+        for level in self.skeleton.part_levels[1:]:
+            limbs = [part for part in level if part in self.limb_parts]
+            if not limbs:
+                continue
+            ends = [self.skeleton.part_of.index(part) for part in limbs]
+            bones = joints[:, ends] - joints[:, [self.skeleton.parents[end] for end in ends]]
+            world = self.world_rotations(point._replace(rotations=rotations))
+            above = world[:, [self.skeleton.part_parents[part] for part in limbs]]
+            seen = ((above @ self.centres[limbs]).mT @ bones[..., None]).squeeze(-1)
+            swing = quaternion_vector_to_matrix(
+                minimal_rotation(self.offsets[ends].expand_as(seen), seen)
+            )
+            told = known[:, ends, None, None]
+            rotations[:, limbs] = torch.where(told, swing, rotations[:, limbs])
+        return point._replace(rotations=rotations)
 
     def _turns(self, angles: Tensor) -> Tensor:
         """Return rotation matrices [..., P, 3, 3] of the parts' turns by angles [..., R]."""

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from torchpose.body._articulation import BodyPoint
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_transition import jump_variance, transition
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Beliefs,
     KeypointFrame,
@@ -201,10 +202,17 @@ class BodyKalmanFilter(nn.Module):
         jumped: Bool[Tensor, "B J"],
         rows: Int[Tensor, " N"],
     ) -> CorrectedBody:
-        """Return the posteriors, of elements with jumped joints from a prediction that is wide there."""
+        """Return the posteriors, of elements with jumped joints from a prediction that is wide there.
+
+        Limbs to such joints begin where cameras agree that they are, since none is found by small steps that
+        points the other way.
+        """
         widened = (jumped[rows].to(state.cov) @ self.articulation.carriers) * self._jump_variance
         wide = state.take(rows)
-        wide = wide._replace(cov=wide.cov + torch.diag_embed(widened))
+        joints = triangulate(self.maps, frame.take(rows))
+        seen = jumped[rows] & joints.isfinite().all(-1)
+        mean = self.articulation.swung(wide.mean, joints.nan_to_num(), seen)
+        wide = wide._replace(mean=mean, cov=wide.cov + torch.diag_embed(widened))
         again = self._iterated(wide, frame.take(rows), _RECOVERY)
         return corrected.put(rows, again._replace(widened=widened))
 

@@ -7,7 +7,6 @@ correction then begins at several headings, with noise that is wide at first. Ev
 
 import math
 from collections.abc import Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import torch
@@ -16,20 +15,17 @@ from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.body._skeleton import BODY_15
-from torchpose.math._rotations import (
-    minimal_rotation,
-    quaternion_vector_to_matrix,
-    rotvec_to_matrix,
-)
+from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
     BodyGaussian,
     BodyKalmanFilter,
     CorrectedBody,
 )
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
-__all__ = ["Start", "start", "triangulate"]
+__all__ = ["Start", "start"]
 
 _HEADINGS, _HEADINGS_OF_ONE = 8, 12
 _WIDTHS = (
@@ -45,7 +41,6 @@ _WIDTHS = (
     1.0,
     1.0,
 )  # factors of the noise's variance
-_AGREE = 6.0  # standard deviations of the noise within which a camera agrees
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
 _LOG_ODDS, _DOUBT = -6.0, -5.0
@@ -78,7 +73,8 @@ def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
     if len(maps.shift) > 1:
         joints = triangulate(maps, frame)
         points = _points(body, motion, maps, joints, _HEADINGS)
-        points = _along_limbs(body, points, joints)
+        joints = joints.repeat_interleave(_HEADINGS, 0)
+        points = body.swung(points, joints, joints.isfinite().all(-1))
         kinds, log_prior = 1, points.position.new_zeros(1)
         state = filter.pulled(_state(points, _initial_cov(motion)[None], maps), 1.0)
     else:
@@ -131,41 +127,6 @@ def _posed_covs(motion: BodyMotion) -> Float[Tensor, "K N N"]:
     columns = motion.articulation.relative_columns
     covs[:, columns, columns] = motion.poses.covariances
     return covs
-
-
-def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
-    """Return joints by the cameras that agree, NaN where no two do.
-
-    The pair of cameras that most others agree with decides; all that agree then count, by linear least
-    squares of u (M p + m)_3 = (M p + m)_12.
-    """
-    rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
-    right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
-    size = maps.matrix[:, 2].norm(dim=-1)[:, None, None]
-    rows, right = rows / size[..., None], right / size
-    there = frame.inlier > 0
-
-    def solve(use: Tensor) -> Tensor:
-        scaled = rows * use.to(rows)[..., None, None]
-        normal = (scaled.mT @ rows).sum(1) + 1e-9 * torch.eye(3).to(rows)
-        return torch.linalg.solve(normal, (scaled.mT @ right[..., None]).sum(1)).squeeze(-1)
-
-    best = torch.full_like(rows[:, 0, :, 0, 0], -1.0)
-    chosen = torch.zeros_like(there)
-    for pair in combinations(range(len(maps.shift)), 2):
-        use = torch.zeros_like(there)
-        use[:, list(pair)] = there[:, list(pair)].all(1, keepdim=True)
-        seen = see(maps, solve(use))
-        variance = frame.variance + frame.relative * seen.by_joint.square().sum((-2, -1)) / 2
-        error = (seen.pixels - frame.pixels).square().sum(-1) / variance
-        agree = there & seen.in_front & (error < _AGREE**2)
-        score = (
-            agree.to(error) - torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
-        ).sum(1)
-        score = torch.where((agree & use).sum(1) == 2, score, -1.0)
-        chosen = torch.where((score > best)[:, None], agree, chosen)
-        best = torch.maximum(best, score)
-    return torch.where((chosen.sum(1) >= 2)[..., None], solve(chosen), torch.nan)
 
 
 def _at_one_depth(
@@ -236,30 +197,6 @@ def _leftwards(
     known = apart.norm(dim=-1, keepdim=True) > _LEAST_WIDTH
     side = torch.where(known, apart, torch.linalg.cross(least, up))
     return torch.nn.functional.normalize(side, dim=-1)
-
-
-def _along_limbs(
-    body: Articulation, points: BodyPoint, joints: Float[Tensor, "B J 3"]
-) -> BodyPoint:
-    """Return the points with limbs swung to the bones between known joints; others stay at their centres."""
-    skeleton = body.skeleton
-    joints = joints.repeat_interleave(len(points.position) // len(joints), 0)
-    rotations = points.rotations.clone()
-    for level in skeleton.part_levels[1:]:
-        limbs = [part for part in level if part in body.limb_parts]
-        if not limbs:
-            continue
-        ends = [skeleton.part_of.index(part) for part in limbs]
-        bones = joints[:, ends] - joints[:, [skeleton.parents[end] for end in ends]]
-        world = body.world_rotations(points._replace(rotations=rotations))
-        above = world[:, [skeleton.part_parents[part] for part in limbs]] @ body.centres[limbs]
-        seen = (above.mT @ bones[..., None]).squeeze(-1)
-        rest = body.offsets[ends].expand_as(seen)
-        swing = quaternion_vector_to_matrix(
-            minimal_rotation(rest, torch.where(seen.isfinite(), seen, rest))
-        )
-        rotations[:, limbs] = swing
-    return points._replace(rotations=rotations)
 
 
 def _initial_cov(motion: BodyMotion) -> Float[Tensor, "N N"]:

@@ -1,0 +1,286 @@
+"""The Kalman filter over bodies against dense algebra, simulated bodies and bad keypoints."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchpose
+from tests.whole_body.keypoints.scenes import FPS, NAMES, errors, moving_body, ring, scene
+from torchpose.body import BODY_15, Body
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.errors import (
+    CameraError,
+    InputError,
+    NobodySeenError,
+    ShapeError,
+    SkeletonError,
+)
+from torchpose.whole_body import BodyTrack, BodyTracker
+
+J = BODY_15.joint
+
+
+def tracker(rig, **options):
+    return BodyTracker(rig, method="kalman", fps=FPS, **options)
+
+
+def track(given, smoothing="none", **options):
+    return tracker(given.rig, **options)(
+        keypoints=given.keypoints, confidence=given.confidence, smoothing=smoothing
+    )
+
+
+@pytest.fixture(scope="module")
+def four():
+    return scene(4)
+
+
+@pytest.fixture(scope="module")
+def filtered(four):
+    return track(four)
+
+
+# --- accuracy ---------------------------------------------------------------------------------------
+
+
+def test_several_cameras_find_joints_to_a_centimetre(four, filtered):
+    assert float(errors(filtered, four.joints)[10:].mean()) < 0.010
+    assert not filtered.coasting.any() and not filtered.failed
+
+
+def test_smoothing_is_nearer_and_surer(four, filtered):
+    smoothed = track(four, "full")
+    assert float(errors(smoothed, four.joints).mean()) < float(errors(filtered, four.joints).mean())
+    spread = smoothed.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1)
+    assert (
+        spread[:-1] <= filtered.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1)[:-1] * 1.01
+    ).all()
+    torch.testing.assert_close(smoothed.joints3d[-1], filtered.joints3d[-1])
+
+
+def test_ellipsoids_hold_what_they_say(four, filtered):
+    away = filtered.joints3d - four.joints
+    solved = torch.linalg.solve(filtered.covariance3d, away[..., None]).squeeze(-1)
+    inside = ((away * solved).sum(-1) < 6.251).double().mean()
+    assert 0.75 < float(inside) < 0.995
+
+
+def test_bones_become_those_of_the_person():
+    tall = scene(4, 50, height=1.95)
+    found = track(tall)
+    wanted = Body.of_height(BODY_15, 1.95).bone_lengths
+    for name in ("left_knee", "right_ankle", "left_elbow"):
+        length = found.details["bone_lengths"][-1, J(name)]
+        assert float((length / wanted[J(name)] - 1).abs()) < 0.03, name
+
+
+def test_one_camera_tells_the_pose_up_to_size():
+    one = scene(1, 20)
+    found = track(one, height=1.7)
+    pixels = one.rig(found.joints3d).pixels
+    assert float((pixels - one.keypoints).norm(dim=-1)[5:].median()) < 15
+    assert not any("how large" in note for note in found.notes)
+    assert any("how large" in note for note in track(one).notes)
+
+
+# --- faults -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("away", [100.0, 1e4, 1e6])
+def test_one_wild_keypoint_moves_nothing(four, filtered, away):
+    keypoints = four.keypoints.clone()
+    keypoints[20, 1, J("left_wrist")] += away
+    found = track(four._replace(keypoints=keypoints))
+    moved = (found.joints3d - filtered.joints3d).norm(dim=-1)
+    assert float(moved[20].max()) < 0.04 and float(moved[23].max()) < 0.02
+    assert float(found.details["inlier"][20, 1, J("left_wrist")]) < 0.01
+
+
+def test_exchanged_sides_of_a_camera_are_told_and_undone(four):
+    keypoints = four.keypoints.clone()
+    legs = [
+        J(f"{side}_{joint}") for side in ("left", "right") for joint in ("hip", "knee", "ankle")
+    ]
+    mirrored = [*legs[3:], *legs[:3]]
+    keypoints[15:20, 2, legs] = four.keypoints[15:20, 2, mirrored]
+    found = track(four._replace(keypoints=keypoints))
+    assert (found.details["exchanged"][15:20, 2, 1] > 0.9).all()
+    assert (found.details["exchanged"][15:20, 2, 0] < 0.1).all()
+    assert (found.details["exchanged"][:15, 2] < 0.1).all()
+    assert float(errors(found, four.joints)[15:20].mean()) < 0.012
+
+
+def test_a_joint_that_no_camera_sees_goes_on_and_comes_back(four):
+    keypoints = four.keypoints.clone()
+    keypoints[20:28, :, J("right_wrist")] = torch.nan
+    found = track(four._replace(keypoints=keypoints))
+    wrong = errors(found, four.joints)[:, J("right_wrist")]
+    assert float(wrong[20:28].max()) < 0.25 and float(wrong[31:].max()) < 0.03
+    std = found.covariance3d[:, J("right_wrist")].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    assert float(std[27]) > 2 * float(std[19])
+
+
+def test_a_limb_that_jumps_is_found_again(four):
+    joints = moving_body(40)
+    joints[20:, J("left_wrist")] = joints[20:, J("left_elbow")] + (
+        joints[20:, J("left_elbow")] - joints[20:, J("left_wrist")]
+    )
+    keypoints = four.rig(joints).pixels
+    found = track(four._replace(keypoints=keypoints))
+    assert float(errors(found, joints)[26:, J("left_wrist")].max()) < 0.05
+
+
+def test_a_person_who_went_away_is_found_elsewhere(four):
+    joints = four.joints.clone()
+    joints[25:] += torch.tensor([0.9, 0.0, -0.6])
+    keypoints = four.rig(joints).pixels
+    keypoints[15:25] = torch.nan
+    found = track(four._replace(keypoints=keypoints))
+    assert found.coasting[15:25].all() and not found.coasting[25:].any()
+    assert float(errors(found, joints)[-1].mean()) < 0.03
+
+
+def test_who_comes_late_has_no_earlier_pose(four):
+    keypoints = four.keypoints.clone()
+    keypoints[:5] = torch.nan
+    found = track(four._replace(keypoints=keypoints))
+    assert found.coasting[:5].all() and not found.respread.any()
+    assert float(errors(found, four.joints)[15:].mean()) < 0.012
+
+
+def test_a_camera_that_sees_something_else_is_named(four):
+    keypoints = four.keypoints.clone()
+    keypoints[:, 3, :, 0] += 400.0
+    notes = track(four._replace(keypoints=keypoints)).notes
+    assert any("camera c3" in note for note in notes)
+    assert not any("camera c0" in note for note in notes)
+
+
+# --- forms ------------------------------------------------------------------------------------------
+
+
+def test_frame_by_frame_gives_the_same(four, filtered):
+    live = tracker(four.rig)
+    state, poses = live.init(), []
+    for keypoints, confidence in zip(four.keypoints, four.confidence, strict=True):
+        state, pose = live.step(state, keypoints=keypoints, confidence=confidence)
+        poses.append(pose.joints3d[0])
+    torch.testing.assert_close(torch.stack(poses), filtered.joints3d, rtol=0, atol=1e-12)
+
+
+def test_a_batch_gives_each_its_own(four, filtered):
+    other = scene(4, seed=5)
+    both = tracker(four.rig)(
+        keypoints=torch.stack([other.keypoints, four.keypoints]),
+        confidence=torch.stack([other.confidence, four.confidence]),
+    )
+    torch.testing.assert_close(both[1].joints3d, filtered.joints3d, rtol=0, atol=1e-9)
+
+
+def test_a_joint_set_in_another_order_and_without_a_pelvis(four, filtered):
+    order = [i for i in range(len(NAMES)) if NAMES[i] != "pelvis"][::-1]
+    found = tracker(four.rig)(
+        keypoints=four.keypoints[:, :, order],
+        confidence=four.confidence[:, :, order],
+        names=[NAMES[i] for i in order],
+    )
+    away = (found.joints3d - filtered.joints3d).norm(dim=-1)[10:]
+    assert float(away[:, J("left_wrist")].max()) < 0.01
+
+
+def test_distorted_keypoints_are_undistorted(four):
+    import cv2
+
+    cameras = []
+    for i in range(4):
+        plain = ring(4)
+        camera = PinholeCamera(
+            1300, 1300, 959.5, 539.5, 1920, 1080, f"c{i}", distortions=(-0.2, 0.05, 0.0, 0.0),
+            rotation=tuple(cv2.Rodrigues(plain.rotation[i].numpy())[0].ravel().tolist()),
+            translation=tuple(plain.translation[i].tolist()),
+        )  # fmt: skip
+        cameras.append(camera)
+    rig = CameraRig(cameras)
+    seen = []
+    for c, camera in enumerate(cameras):
+        points = four.joints.reshape(-1, 1, 3).numpy()
+        pixels, _ = cv2.projectPoints(
+            points, cv2.Rodrigues(rig.rotation[c].numpy())[0], rig.translation[c].numpy(),
+            camera.matrix.numpy(), camera.distortions.numpy(),
+        )  # fmt: skip
+        seen.append(torch.from_numpy(np.asarray(pixels)).reshape(*four.joints.shape[:2], 2))
+    distorted = torch.stack(seen, 1)
+    straight = rig.undistort_points(distorted)
+    torch.testing.assert_close(straight, rig(four.joints).pixels, rtol=0, atol=0.01)
+    found = tracker(rig)(keypoints=distorted)
+    assert float(errors(found, four.joints)[10:].mean()) < 0.008
+
+
+def test_tracks_are_saved_and_read_back(tmp_path, filtered):
+    filtered.save(tmp_path / "body.npz")
+    back = BodyTrack.load(tmp_path / "body.npz")
+    assert back.method == "kalman"
+    torch.testing.assert_close(back.details["inlier"], filtered.details["inlier"])
+    torch.testing.assert_close(back.joints3d, filtered.joints3d)
+
+
+def test_a_known_body_keeps_its_bones(four, filtered):
+    body = Body.of_height(BODY_15, 1.7)
+    found = track(four, body=body)
+    lengths = found.details["bone_lengths"][:, J("left_knee")]
+    assert float((lengths / body.bone_lengths[J("left_knee")] - 1).abs().max()) < 0.02
+
+
+# --- input that cannot be right -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"keypoints": torch.zeros(3, 2, 15, 2)}, ShapeError, "keypoints"),
+        ({"keypoints": torch.full((3, 4, 15, 2), torch.nan)}, NobodySeenError, "no keypoint"),
+        ({"names": ["nose"] * 15}, SkeletonError, "nose"),
+        ({"confidence": torch.full((40, 4, 15), -1.0)}, InputError, "negative"),
+        ({"confidence": torch.ones(40, 4, 3)}, ShapeError, "confidence"),
+        ({"covariance": torch.zeros(40, 4, 15)}, InputError, "covariance"),
+        ({"smoothing": "some"}, InputError, "smoothing"),
+        ({"keypoints": None}, InputError, "keypoints"),
+    ],
+)
+def test_bad_input_is_refused(four, change, error, words):
+    given = {"keypoints": four.keypoints, "confidence": None, **change}
+    with pytest.raises(error, match=words):
+        tracker(four.rig)(**given)
+
+
+def test_keypoints_of_another_image_size_are_refused(four):
+    with pytest.raises(CameraError, match="scaled"):
+        tracker(four.rig)(keypoints=4 * four.keypoints)
+
+
+def test_cameras_in_millimetres_are_refused():
+    camera = PinholeCamera(1300, 1300, 959.5, 539.5, 1920, 1080, translation=(0, 0, 4000.0))
+    with pytest.raises(CameraError, match="metres"):
+        tracker(camera)
+
+
+@pytest.mark.parametrize(
+    "options", [{"n_layers": 3}, {"manifold": "walk"}, {"keypoint_std": -1.0}, {"height": 0.0}]
+)
+def test_options_of_other_methods_are_refused(options):
+    with pytest.raises(InputError):
+        tracker(ring(2), **options)
+
+
+def test_other_methods_take_no_keypoints(four):
+    with pytest.raises(InputError, match="kalman"):
+        BodyTracker(four.rig, "apf")(keypoints=four.keypoints)
+    with pytest.raises(InputError, match="kalman"):
+        BodyTracker(four.rig, "apf", keypoint_std=0.01)
+
+
+def test_the_tracker_is_at_the_top():
+    assert torchpose.BodyTracker is BodyTracker
+    assert math.isclose(tracker(ring(2)).fps, FPS)
