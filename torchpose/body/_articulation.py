@@ -246,8 +246,8 @@ class Articulation(nn.Module):
 
         Args:
             point: [B]. joints: metres, world axes.
-            known: whether a joint is known; a limb from a joint that is not begins where the point has it, and
-                one to such a joint stays as it is.
+            known: whether a joint is known; a limb from a joint that is not begins where the point has it,
+                and one to such a joint stays as it is.
         """
         joints = torch.where(known[..., None], joints, self.joints(point))
         rotations = point.rotations.clone()
