@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tests.data import data_dir_or_skip
 from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
 from torchpose.io import Keypoints, read_keypoints, write_keypoints
+from torchpose.io._formats.openpose import _BODY_25B
 from torchpose.skeleton import SKELETONS
 
 NAMES = ("head", "lhand", "RWrist")
@@ -264,6 +265,28 @@ def test_openpose_folder(tmp_path, joints):
     assert read.measured.any(-1).tolist() == [True, True, False, False, True]
     assert read.keypoints[:, 3, 0].nan_to_num(-1).tolist() == [10, 11, -1, -1, 13]
     assert read.neck == "mid-shoulder"
+
+
+_STANDING = {  # pixels
+    "Nose": (0, -60), "LEye": (3, -63), "REye": (-3, -63), "LEar": (8, -60), "REar": (-8, -60),
+    "Neck": (0, 0), "MidHip": (0, 100), "Head": (0, -80), "LShoulder": (35, 0), "RShoulder": (-35, 0),
+    "LElbow": (45, 50), "RElbow": (-45, 50), "LWrist": (50, 95), "RWrist": (-50, 95), "LHip": (18, 100),
+    "RHip": (-18, 100), "LKnee": (20, 190), "RKnee": (-20, 190), "LAnkle": (20, 280), "RAnkle": (-20, 280),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("layout", ["BODY_25", "BODY_25B"])
+def test_the_two_orders_of_25_keypoints_are_told_apart(tmp_path, layout, behind):
+    names = SKELETONS["openpose-25"].joints if layout == "BODY_25" else _BODY_25B
+    faces = ("Nose", "LEye", "REye", "LEar", "REar")
+    flat = []
+    for name in names:
+        x, y = _STANDING.get(name, (15, 295))
+        seen = not (behind and name in faces)
+        flat += [500.0 + x, 300.0 + y, 0.9] if seen else [0.0, 0.0, 0.0]
+    frame(tmp_path / "json", 0, {"pose_keypoints_2d": flat})
+    assert read_keypoints(tmp_path / "json").names == tuple(names)
 
 
 def test_the_most_confident_person_is_followed(tmp_path):

@@ -19,6 +19,13 @@ __all__ = ["read_openpose"]
 
 _SUFFIX = "_keypoints.json"
 _LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
+_BODY_25B = (
+    "Nose", "LEye", "REye", "LEar", "REar", "LShoulder", "RShoulder", "LElbow", "RElbow", "LWrist", "RWrist",
+    "LHip", "RHip", "LKnee", "RKnee", "LAnkle", "RAnkle", "Neck", "Head", "LBigToe", "LSmallToe", "LHeel",
+    "RBigToe", "RSmallToe", "RHeel",
+)  # fmt: skip
+_MIDDLES = {"Neck": "Shoulder", "MidHip": "Hip"}  # of BODY_25
+_OFF_MIDDLE = 0.08  # of a person's extent; a detector is off by a tenth of it
 _EXPECTED = "OpenPose's JSON with people / pose_keypoints_2d"
 _FAR = 1e9  # pixels; no keypoint is there
 
@@ -32,9 +39,9 @@ def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str
         folder: the folder.
 
     Returns:
-        keypoints [T, J, 2], pixels, NaN where missing; confidence [T, J]; the J names of BODY_25 or
-        COCO 18, whichever the files hold. BODY_25B has as many keypoints as BODY_25 in another order
-        and cannot be told from it: do not pass it here.
+        keypoints [T, J, 2], pixels, NaN where missing; confidence [T, J]; the J names of BODY_25,
+        BODY_25B or COCO 18, whichever the files hold. BODY_25B has as many keypoints as BODY_25 in another
+        order; where the necks and hips are tells which it is.
 
     Raises:
         InputError: no such files, or nobody in any of them. FileFormatError: not OpenPose's JSON,
@@ -47,10 +54,11 @@ def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str
         raise InputError(f"{folder}: nobody was found in any of {len(files)} frames")
     if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
         raise FileFormatError(
-            f"{folder}: expected 25 keypoints (BODY_25) or 18 (COCO) for everybody, got "
+            f"{folder}: expected 25 keypoints (BODY_25 or BODY_25B) or 18 (COCO) for everybody, got "
             f"{', '.join(map(str, sorted(sizes)))}"
         )
-    names = _LAYOUTS[sizes.pop()]
+    everybody = np.stack([person for group in people.values() for person in group])
+    names = _BODY_25B if _is_body_25b(everybody) else _LAYOUTS[everybody.shape[1]]
     first, last = min(files), max(files)
     table = np.zeros((last - first + 1, len(names), 3))
     followed = None
@@ -95,6 +103,39 @@ def _people(path: Path) -> list[np.ndarray]:
         if array.size and (array[2::3] > 0).any():
             people.append(array.reshape(-1, 3))
     return people
+
+
+def _is_body_25b(people: np.ndarray) -> bool:
+    """Return whether keypoints [P, 25, 3] are in the order of BODY_25B.
+
+    BODY_25 has its neck in the middle of the shoulders and a middle of the hips. In the other order what has
+    these places is scattered over the body, or missing in a view from behind.
+    """
+    if people.shape[1] != len(_BODY_25B):
+        return False
+    pixels = np.where(people[..., 2:] > 0, people[..., :2], np.nan)
+    off = [_off_middle(pixels, _LAYOUTS[25], *pair) for pair in _MIDDLES.items()]
+    known = [value for value in off if value is not None]
+    if known:
+        return float(np.mean(known)) > _OFF_MIDDLE
+    other = _off_middle(pixels, _BODY_25B, "Neck", "Shoulder")
+    return other is not None and other < _OFF_MIDDLE
+
+
+def _off_middle(
+    pixels: np.ndarray, names: tuple[str, ...], centre: str, joint: str
+) -> float | None:
+    """Return the median distance of a joint from a middle over the person's extent, None if unknown."""
+    left, right, middle = (
+        pixels[:, names.index(name)] for name in (f"L{joint}", f"R{joint}", centre)
+    )
+    away = np.linalg.norm(middle - (left + right) / 2, axis=-1)
+    known = np.isfinite(away)
+    if not known.any():
+        return None
+    seen = pixels[known]
+    extent = (np.nanmax(seen, 1) - np.nanmin(seen, 1)).max(-1)
+    return float(np.median(away[known] / np.maximum(extent, 1e-9)))
 
 
 def _pick(people: np.ndarray, followed: np.ndarray | None) -> np.ndarray:
