@@ -37,6 +37,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     squared_errors,
     weigh,
 )
+from torchpose.whole_body._keypoints.upright import Upright
 
 __all__ = ["BodyGaussian", "BodyKalmanFilter", "CorrectedBody"]
 
@@ -141,14 +142,20 @@ class BodyKalmanFilter(nn.Module):
 
     Args:
         motion: how bodies move. maps: the cameras. fps: frames per second. n_iterations: of a correction.
+        upright: how people lean, if it is known which way is up.
     """
 
     def __init__(
-        self, motion: BodyMotion, maps: RigMaps, fps: float, n_iterations: int = 3
+        self,
+        motion: BodyMotion,
+        maps: RigMaps,
+        fps: float,
+        n_iterations: int = 3,
+        upright: Upright | None = None,
     ) -> None:
         super().__init__()
         self.motion, self.maps, self.fps, self.n_iterations = motion, maps, fps, n_iterations
-        self.articulation = motion.articulation
+        self.articulation, self.upright = motion.articulation, upright
         self.exchange = exchange_of(self.articulation.skeleton)
         self.transition = transition(motion, 1 / fps)
         self._jump_variance = jump_variance(motion)
@@ -162,7 +169,7 @@ class BodyKalmanFilter(nn.Module):
         return self.pulled(BodyGaussian(mean, cov, log_odds, state.scale, doubt), model.share)
 
     def pulled(self, state: BodyGaussian, share: float) -> BodyGaussian:
-        """Return the Gaussian after a share of the pose prior's information."""
+        """Return the Gaussian after a share of the information of the priors over poses and leans."""
         a, columns = self.articulation, self.articulation.relative_columns
         pull = self.motion.pull(a.relative_angles(state.mean), state.cov[..., columns, columns])
         HP = state.cov[..., columns, :]
@@ -173,7 +180,19 @@ class BodyKalmanFilter(nn.Module):
         y = share * pull.slope
         solved = torch.cholesky_solve(L.mT @ (G @ y[..., None]), chol)
         step = (HP.mT @ (y[..., None] - L @ solved)).squeeze(-1)
-        return state._replace(mean=a.moved(state.mean, step), cov=state.cov - U.mT @ U)
+        state = state._replace(mean=a.moved(state.mean, step), cov=state.cov - U.mT @ U)
+        return state if self.upright is None else self._erected(state, self.upright, share)
+
+    def _erected(self, state: BodyGaussian, upright: Upright, share: float) -> BodyGaussian:
+        """Return the Gaussian after a share of the information about the lean of the pelvis."""
+        gap, H = upright.lean(self.articulation, state.mean)
+        HP = H @ state.cov
+        spread = HP @ H.mT + torch.diag(upright.variance / share)
+        chol = torch.linalg.cholesky((spread + spread.mT) / 2)
+        U = torch.linalg.solve_triangular(chol, HP, upper=False)
+        step = (HP.mT @ torch.cholesky_solve(gap[..., None], chol)).squeeze(-1)
+        mean = self.articulation.moved(state.mean, step)
+        return state._replace(mean=mean, cov=state.cov - U.mT @ U)
 
     def correct(
         self, state: BodyGaussian, frame: KeypointFrame, widths: Sequence[float] | None = None

@@ -19,6 +19,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
 from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
 __all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
 
@@ -71,13 +72,21 @@ class KeypointTracker(nn.Module):
 
     Args:
         rig: the cameras. fps: frames per second. motion: how bodies move. n_iterations: of a correction.
+        upright: how people lean, if it is known which way is up; with one camera, this is taken to be level.
     """
 
     def __init__(
-        self, rig: CameraRig, fps: float, motion: BodyMotion, n_iterations: int = 3
+        self,
+        rig: CameraRig,
+        fps: float,
+        motion: BodyMotion,
+        n_iterations: int = 3,
+        upright: Upright | None = None,
     ) -> None:
         super().__init__()
-        self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations)
+        if upright is None and len(rig) == 1:
+            upright = camera_up(rig)
+        self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
         self.n_hypotheses = _HYPOTHESES if len(rig) == 1 else 1
 
     def forward(

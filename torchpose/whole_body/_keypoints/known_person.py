@@ -1,6 +1,7 @@
 """Put what is known of a person into the prior over bodies: bone lengths, or the height."""
 
 import copy
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -13,7 +14,10 @@ from torchpose.priors._body_motion import BodyMotion
 __all__ = ["of_one_camera", "with_body", "with_height"]
 
 _LENGTH_STD = 0.01  # of the log of a given bone length
-_PULL_TIME_OF_ONE = 0.1  # seconds
+_TRUNK = ("neck", "shoulder", "hip")  # where joint sets differ in what they call a joint
+_TRUNK_STD_OF_ONE = 0.1  # of the log of their lengths
+_SHIFT_STD_OF_ONE, _SHIFT_TIME_OF_ONE = 0.015, 0.5  # metres, seconds
+_PULL_TIME_OF_ONE = 0.05  # seconds
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
 
 
@@ -27,7 +31,7 @@ def with_body(motion: BodyMotion, body: Body) -> BodyMotion:
         raise SkeletonError(f"expected a body of 'body-15', got {body.skeleton.name!r}")
     scales = motion.articulation.scales_of(body.bone_lengths.to(motion.scale_mean))
     cov = _LENGTH_STD**2 * torch.eye(len(scales)).to(scales)
-    return _with_scales(motion, scales, cov)
+    return _with(motion, {"scale_mean": scales, "scale_cov": cov})
 
 
 def with_height(motion: BodyMotion, height: float) -> BodyMotion:
@@ -40,27 +44,33 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     gain = cross / (told @ cross + _HEIGHT_STD**2)
     mean = motion.scale_mean + gain * (wanted - told @ motion.scale_mean)
     cov = motion.scale_cov - gain[:, None] * cross
-    return _with_scales(motion, mean, (cov + cov.mT) / 2)
+    return _with(motion, {"scale_mean": mean, "scale_cov": (cov + cov.mT) / 2})
 
 
 def of_one_camera(motion: BodyMotion, lengths_fixed: bool) -> BodyMotion:
     """Return the prior for one camera, in which neither sizes nor the depths of limbs are seen.
 
-    Bone lengths stay those that are expected: corrections that are linear in them would shrink the body
-    frame by frame, since a bone that is seen shorter is mostly turned and not short. Poses are pulled to
-    the mixture more strongly.
+    Limbs keep the lengths that are expected, and the trunk nearly. Corrections that are linear in lengths
+    would shrink the body frame by frame, since a bone that is seen shorter is mostly turned and not short.
+    For the same reason joints of the trunk shift little. Poses are pulled to the mixture more strongly.
 
     Args:
-        lengths_fixed: whether lengths are to be fixed; a given body's are already.
+        motion: the prior. lengths_fixed: whether lengths are to be fixed; a given body's are already.
     """
-    other = copy.copy(motion)
-    cov = _LENGTH_STD**2 * torch.eye(len(motion.scale_mean)).to(motion.scale_cov)
-    pull_time = torch.full_like(motion.pull_time, _PULL_TIME_OF_ONE)
-    other._buffers = {**motion._buffers, "pull_time": pull_time}
-    return _with_scales(other, other.scale_mean, cov) if lengths_fixed else other
+    std = torch.full_like(motion.scale_mean, _LENGTH_STD)
+    std[[motion.articulation.groups.index(name) for name in _TRUNK]] = _TRUNK_STD_OF_ONE
+    given = {
+        "pull_time": torch.full_like(motion.pull_time, _PULL_TIME_OF_ONE),
+        "shift_std": torch.full_like(motion.shift_std, _SHIFT_STD_OF_ONE),
+        "shift_time": torch.full_like(motion.shift_time, _SHIFT_TIME_OF_ONE),
+    }
+    if lengths_fixed:
+        given["scale_cov"] = torch.diag(std.square())
+    return _with(motion, given)
 
 
-def _with_scales(motion: BodyMotion, mean: Tensor, cov: Tensor) -> BodyMotion:
+def _with(motion: BodyMotion, given: Mapping[str, Tensor]) -> BodyMotion:
+    """Return the prior with some of its tensors replaced."""
     other = copy.copy(motion)
-    other._buffers = {**motion._buffers, "scale_mean": mean, "scale_cov": cov}
+    other._buffers = {**motion._buffers, **given}
     return other

@@ -1,0 +1,51 @@
+"""Expect people to be upright where it is known, at least roughly, which way is up."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.camera._rig import CameraRig
+
+__all__ = ["Lean", "Upright", "camera_up"]
+
+# Of the upward direction in the axes of the pelvis, to the left and forward, rounded from recordings.
+_MEAN, _STD = (0.0, -0.1), (0.1, 0.25)
+_TILT = (0.15, 0.25)  # radians, standard deviations of the roll and pitch of a camera
+
+
+class Lean(NamedTuple):
+    """Holds the gap [B, 2] between expected and actual lean, and its derivative [B, 2, N] by the tangent."""
+
+    gap: Tensor
+    jacobian: Tensor
+
+
+class Upright(NamedTuple):
+    """Holds the direction that is up [3], world axes, and mean and variance [2] of a pelvis' lean against it.
+
+    The lean is the upward direction in the axes of the pelvis, to its left and forward, R^T u.
+    """
+
+    direction: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def lean(self, articulation: Articulation, point: BodyPoint) -> Lean:
+        """Return how far bodies are from the expected lean: a turn d changes R^T u by (R^T u) x d."""
+        up = (point.rotations[..., 0, :, :].mT @ self.direction[:, None]).squeeze(-1)
+        x, y, z = up.unbind(-1)
+        o = torch.zeros_like(x)
+        turned = torch.stack([torch.stack([o, -z, y], -1), torch.stack([-y, x, o], -1)], -2)
+        jacobian = up.new_zeros(*up.shape[:-1], 2, articulation.dim)
+        start = articulation.columns["rotations"].start
+        jacobian[..., start : start + 3] = turned
+        return Lean(self.mean - torch.stack([x, z], -1), jacobian)
+
+
+def camera_up(rig: CameraRig) -> Upright:
+    """Return what is expected where the first camera is about level, which is all that is known."""
+    direction = -rig.rotation[0, 1]
+    std, tilt = (torch.tensor(values).to(direction) for values in (_STD, _TILT))
+    return Upright(direction, torch.tensor(_MEAN).to(direction), std.square() + tilt.square())
