@@ -194,11 +194,12 @@ class KeypointTracker(nn.Module):
     ) -> Float[Tensor, " B"]:
         """Return for how many frames in a row keypoints have been of something else, or of the other side.
 
-        A camera that seems to exchange all sides counts half: where it goes on, the body is turned round.
+        A camera that seems to exchange sides counts half: detectors do so for moments, and where it goes on,
+        it is the body that has them the wrong way round.
         """
         expected = frame.inlier.sum((-2, -1))
         found = (weighed.own + weighed.other).sum((-2, -1))
-        turned = (weighed.exchanged > 0.5).all(-1).any(-1)
+        turned = (weighed.exchanged > 0.5).any(-1).any(-1)
         grown = stream.lost + torch.where(found < _LOST * expected, 1.0, 0.5)
         astray = (found < _LOST * expected) | turned
         return torch.where(expected > 0, torch.where(astray, grown, 0.0), stream.lost)
