@@ -64,7 +64,7 @@ class BodyMotionRecipe:
     n_components: int = 16
     n_samples: int = 12000
     covariance_floor: float = 0.06
-    acceleration_scale: float = 1.25
+    acceleration_scale: float = 1.45
     least_shift: float = 0.01
     pull_time: float = 1.0
     seed: int = 0

@@ -58,8 +58,10 @@ class BodyTransition(NamedTuple):
 def transition(motion: BodyMotion, dt: float) -> BodyTransition:
     """Return the model of a frame of dt seconds.
 
-    Position and angles: x' = x + (1 - a) / decay v,  v' = a v,  a = exp(-decay dt), with the noise of white
-    acceleration, q^2 [dt^3 / 3, dt^2 / 2; dt^2 / 2, dt].
+    Position and angles: x' = x + b v,  v' = a v,  a = exp(-decay dt),  b = (1 - a) / decay, with the noise of
+    white acceleration q,
+
+        q^2 [(dt - 2 b + (1 - a^2) / (2 decay)) / decay^2,  b^2 / 2;  b^2 / 2,  (1 - a^2) / (2 decay)].
     """
     body = motion.articulation
     at = body.columns
@@ -69,10 +71,11 @@ def transition(motion: BodyMotion, dt: float) -> BodyTransition:
     keep = torch.exp(-motion.decay * dt)
     matrix[pose, velocity] = (1 - keep) / motion.decay
     matrix[velocity, velocity] = keep
-    power = motion.acceleration.square()
-    noise[pose, pose] = power * dt**3 / 3
-    noise[pose, velocity] = noise[velocity, pose] = power * dt**2 / 2
-    noise[velocity, velocity] = power * dt
+    power, decay = motion.acceleration.square(), motion.decay
+    gone = (1 - keep) / decay
+    noise[pose, pose] = power / decay.square() * (dt - 2 * gone + (1 - keep.square()) / (2 * decay))
+    noise[pose, velocity] = noise[velocity, pose] = power * gone.square() / 2
+    noise[velocity, velocity] = power * (1 - keep.square()) / (2 * decay)
     shifts = _index(at["shifts"])
     held = torch.exp(-dt / motion.shift_time)
     matrix[shifts, shifts] = held

@@ -1,0 +1,148 @@
+"""Parts of tracking by keypoints against finite differences, dense algebra and exact geometry."""
+
+import pytest
+import torch
+
+from tests.whole_body.keypoints.scenes import ring, scene
+from torchpose.body import BODY_15
+from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
+from torchpose.whole_body._keypoints.body_transition import transition
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    KeypointFrame,
+    RigMaps,
+    exchange_of,
+    information,
+    see,
+    weigh,
+)
+from torchpose.whole_body._keypoints.known_person import of_one_camera, with_height
+from torchpose.whole_body._keypoints.upright import camera_up
+
+J = BODY_15.joint
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return load_body_motion("whole-body")
+
+
+def random_point(articulation: Articulation, count: int = 2, seed: int = 0) -> BodyPoint:
+    generator = torch.Generator().manual_seed(seed)
+    n_parts = len(articulation.skeleton.parts)
+    zero = torch.zeros(count, articulation.n_pose, dtype=torch.float64)
+    rest = BodyPoint(
+        zero[:, :3],
+        torch.eye(3, dtype=torch.float64).expand(count, n_parts, 3, 3),
+        zero,
+        zero[:, : len(articulation.groups)],
+        zero.new_zeros(count, len(articulation.shifted), 3),
+    )
+    step = 0.3 * torch.randn(count, articulation.dim, generator=generator, dtype=torch.float64)
+    return articulation.moved(rest, step)
+
+
+def frame_of(given, t: int = 0) -> KeypointFrame:
+    one = torch.ones_like(given.confidence[t : t + 1])
+    return KeypointFrame(given.keypoints[t : t + 1], 16 * one, 0 * one, 0.9 * one)
+
+
+def test_the_lean_has_the_slope_of_differences():
+    body, upright = Articulation(), camera_up(ring(1))
+    point, lean = random_point(body), None
+    lean = upright.lean(body, point)
+    for column in range(body.dim):
+        step = torch.zeros(2, body.dim, dtype=torch.float64)
+        step[:, column] = 1e-6
+        ahead, behind = (upright.lean(body, body.moved(point, s)).gap for s in (step, -step))
+        slope = (behind - ahead) / 2e-6  # of the lean, which the gap takes away
+        torch.testing.assert_close(lean.jacobian[..., column], slope, rtol=0, atol=1e-8)
+
+
+def test_what_cameras_see_has_the_slope_of_differences():
+    maps, joints = RigMaps.of(ring(3)), scene(3, 1).joints
+    seen = see(maps, joints)
+    for axis in range(3):
+        step = torch.zeros_like(joints)
+        step[..., axis] = 1e-6
+        slope = (see(maps, joints + step).pixels - see(maps, joints - step).pixels) / 2e-6
+        torch.testing.assert_close(seen.by_joint[..., axis], slope, rtol=1e-6, atol=1e-5)
+
+
+def test_exact_keypoints_are_triangulated_exactly_and_outliers_left_out():
+    given = scene(4, 1, noise=0.0)
+    keypoints = given.keypoints.clone()
+    keypoints[0, 2, J("left_wrist")] += 300.0
+    keypoints[0, 0, J("head")] -= 500.0
+    found = triangulate(RigMaps.of(given.rig), frame_of(given._replace(keypoints=keypoints)))
+    torch.testing.assert_close(found, given.joints[:1], rtol=0, atol=1e-6)
+
+
+def test_a_joint_that_one_camera_sees_is_not_triangulated():
+    given = scene(3, 1)
+    frame = frame_of(given)
+    frame.inlier[0, 1:, J("left_knee")] = 0
+    found = triangulate(RigMaps.of(given.rig), frame)
+    assert found[0, J("left_knee")].isnan().all() and found[0, J("right_knee")].isfinite().all()
+
+
+def test_one_iteration_is_the_dense_kalman_update(motion):
+    """The same posterior as of all pixels stacked, R weighted by the inlier probabilities."""
+    given = scene(3, 1)
+    maps, body = RigMaps.of(given.rig), motion.articulation
+    point = random_point(body, 1)
+    point = point._replace(position=torch.zeros(1, 3, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(1)
+    root = torch.randn(body.dim, body.dim, generator=generator, dtype=torch.float64)
+    cov = (root @ root.mT * 1e-3 + 1e-3 * torch.eye(body.dim, dtype=torch.float64))[None]
+    new = point.position.new_full
+    state = BodyGaussian(point, cov, new((1, 3, 2), -50.0), new((1, 3), 1.0), new((1, 15), -5.0))
+    frame = frame_of(given)
+    found = BodyKalmanFilter(motion, maps, 30.0).correct(state, frame, (1.0,))
+
+    joints, jacobian = body.linearise(point)
+    seen = see(maps, joints)
+    spread = jacobian @ cov[:, None] @ jacobian.mT
+    exchange = exchange_of(BODY_15)
+    weighed = weigh(frame, seen, maps, state.beliefs, exchange, spread, marginal=True)
+    H = torch.einsum("bcjik,bjkn->bcjin", seen.by_joint, jacobian).reshape(-1, body.dim)
+    weight = (weighed.own / weighed.variance)[..., None].expand(-1, -1, -1, 2).reshape(-1)
+    residual = (frame.pixels - seen.pixels).reshape(-1)
+    precision = torch.linalg.inv(cov[0]) + H.mT @ (weight[:, None] * H)
+    dense = torch.linalg.inv(precision)
+    step = dense @ H.mT @ (weight * residual)
+    torch.testing.assert_close(found.state.cov[0], dense, rtol=1e-5, atol=1e-9)
+    moved = body.joints(body.moved(point, step[None]))
+    torch.testing.assert_close(found.joints, moved, rtol=0, atol=1e-6)
+    W, _ = information(frame, seen, weighed, exchange)
+    assert (torch.linalg.eigvalsh(W) >= -1e-6).all()
+
+
+def test_a_prediction_in_two_halves_is_one(motion):
+    whole, half = transition(motion, 0.04), transition(motion, 0.02)
+    torch.testing.assert_close(half.matrix @ half.matrix, whole.matrix, rtol=1e-10, atol=1e-12)
+    noise = half.matrix @ half.noise @ half.matrix.mT + half.noise
+    torch.testing.assert_close(noise, whole.noise, rtol=1e-8, atol=1e-14)
+
+
+def test_a_height_tells_the_legs(motion):
+    tall = with_height(motion, 2.0)
+    body = motion.articulation
+    legs = [body.groups.index(name) for name in ("knee", "ankle")]
+    wanted = body.scales_of(BODY_15.standard_lengths(2.0))[legs].mean()
+    assert float((tall.scale_mean[legs].mean() - wanted).abs()) < 0.03
+    before, after = (m.scale_cov.diagonal()[legs] for m in (motion, tall))
+    assert (after < before).all()
+    assert (torch.linalg.eigvalsh(tall.scale_cov) > 0).all()
+
+
+def test_one_camera_fixes_limbs_and_leaves_the_prior_alone(motion):
+    before = motion.scale_cov.clone()
+    one = of_one_camera(motion, lengths_fixed=True)
+    std = one.scale_cov.diagonal().sqrt()
+    assert float(std[motion.articulation.groups.index("knee")]) == pytest.approx(0.01)
+    assert float(std[motion.articulation.groups.index("neck")]) == pytest.approx(0.1)
+    assert float(one.pull_time) < float(motion.pull_time)
+    torch.testing.assert_close(motion.scale_cov, before)
