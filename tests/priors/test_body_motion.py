@@ -5,7 +5,7 @@ import torch
 
 from tests.priors.mixtures import random_mixture
 from tests.priors.motions import some_body_motion
-from torchpose.errors import FileFormatError, PriorError, ShapeError
+from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
 from torchpose.priors import GaussianMixture
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
 from torchpose.priors._shipped import load_body_motion
@@ -26,6 +26,14 @@ def test_a_file_brings_it_back(tmp_path):
         BodyMotion.load(path)
     path.write_bytes(whole.replace(b"torchpose-body-motion", b"torchpose-body-notion"))
     with pytest.raises(FileFormatError, match="body-motion"):
+        BodyMotion.load(path)
+
+
+def test_damage_to_the_mixture_names_the_file(tmp_path):
+    motion, path = some_body_motion(), tmp_path / "body.safetensors"
+    motion.poses.weights.mul_(3.0)
+    motion.save(path)
+    with pytest.raises(InputError, match=r"body\.safetensors: weights must sum to 1"):
         BodyMotion.load(path)
 
 

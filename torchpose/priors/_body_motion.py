@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import check_shape
 from torchpose._core.module_state import derived, register_given
+from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.body._articulation import Articulation
 from torchpose.errors import PriorError
@@ -170,6 +171,7 @@ class BodyMotion(nn.Module):
             InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
         """
         info, tensors = read_tensors(path, _KIND)
-        given = {name: value.double() for name, value in tensors.items()}
-        poses = GaussianMixture(*(given.pop(n) for n in ("weights", "means", "covariances")))
-        return cls(**given, poses=poses, info=info)  # type: ignore[arg-type]
+        with reading(path, "a prior over bodies"):
+            given = {name: value.double() for name, value in tensors.items()}
+            poses = GaussianMixture(*(given.pop(n) for n in ("weights", "means", "covariances")))
+            return cls(**given, poses=poses, info=info)  # type: ignore[arg-type]
