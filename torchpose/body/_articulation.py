@@ -111,6 +111,7 @@ class Articulation(nn.Module):
         self.shifted = tuple(j for j, p in enumerate(skeleton.part_of) if j and not limbs[p])
         axes = [(p, a) for p, limb in enumerate(limbs) for a in ((0, 2) if limb else (0, 1, 2))]
         self.n_rotations, self.n_pose = len(axes), 3 + len(axes)
+        self.n_root = sum(part == 0 for part, _ in axes)
         self.limb_parts = tuple(p for p, limb in enumerate(limbs) if limb)
         self.dim = 2 * self.n_pose + len(groups) + 3 * len(self.shifted)
         path = _paths(skeleton.parents)
@@ -155,14 +156,12 @@ class Articulation(nn.Module):
     def relative_columns(self) -> slice:
         """Return the columns of the angles of all parts but the root."""
         rotations = self.columns["rotations"]
-        root = int((self.axis_part == 0).sum())
-        return slice(rotations.start + root, rotations.stop)
+        return slice(rotations.start + self.n_root, rotations.stop)
 
     def relative_angles(self, point: BodyPoint) -> Float[Tensor, "*batch Q"]:
         """Return rotation vectors of all parts but the root about their centres, on their axes, radians."""
         turns = _rotation_vectors(point.rotations)
-        root = int((self.axis_part == 0).sum())
-        return turns[..., self.axis_part[root:], self.axis[root:]]
+        return turns[..., self.axis_part[self.n_root :], self.axis[self.n_root :]]
 
     def scales_of(self, lengths: Float[Tensor, "*batch J"]) -> Float[Tensor, "*batch G"]:
         """Return the logarithms of bone lengths over the standard ones, both sides averaged."""
@@ -212,44 +211,23 @@ class Articulation(nn.Module):
 
     def untwisted(self, point: BodyPoint) -> BodyPoint:
         """Return the same joints with limbs that have no twist about their centres."""
-        rotations = point.rotations
-        limbs = list(self.limb_parts)
-        joints = [self.skeleton.part_of.index(p) for p in limbs]
-        bones = self.offsets[joints]
-        seen = (rotations[..., limbs, :, :] @ bones[..., None]).squeeze(-1)
-        swing = quaternion_vector_to_matrix(minimal_rotation(bones.expand_as(seen), seen))
-        twist = swing.mT @ rotations[..., limbs, :, :]
-        changed = rotations.clone()
-        changed[..., limbs, :, :] = swing
-        for limb, parent in ((p, self.skeleton.part_parents[p]) for p in limbs):
-            if parent in limbs:  # what the part above has lost in twist, this part gets
-                centre = self.centres[limb]
-                lost = centre.mT @ twist[..., limbs.index(parent), :, :] @ centre
-                seen = (
-                    lost
-                    @ rotations[..., limb, :, :]
-                    @ self.offsets[self.skeleton.part_of.index(limb)][:, None]
-                )[..., 0]
-                bone = self.offsets[self.skeleton.part_of.index(limb)]
-                changed[..., limb, :, :] = quaternion_vector_to_matrix(
-                    minimal_rotation(bone.expand_as(seen), seen)
-                )
-        return point._replace(rotations=changed)
+        return self.swung(point, self.joints(point))
 
     def swung(
         self,
         point: BodyPoint,
         joints: Float[Tensor, "B J 3"],
-        known: Bool[Tensor, "B J"],
+        known: Bool[Tensor, "B J"] | None = None,
     ) -> BodyPoint:
         """Return points with limbs swung to bones that are known, without twist about their centres.
 
         Args:
             point: [B]. joints: metres, world axes.
             known: whether a joint is known; a limb from a joint that is not begins where the point has it,
-                and one to such a joint stays as it is.
+                and one to such a joint stays as it is. None: all are.
         """
-        joints = torch.where(known[..., None], joints, self.joints(point))
+        if known is not None:
+            joints = torch.where(known[..., None], joints, self.joints(point))
         rotations = point.rotations.clone()
         for level in self.skeleton.part_levels[1:]:
             limbs = [part for part in level if part in self.limb_parts]
@@ -263,8 +241,9 @@ class Articulation(nn.Module):
             swing = quaternion_vector_to_matrix(
                 minimal_rotation(self.offsets[ends].expand_as(seen), seen)
             )
-            told = known[:, ends, None, None]
-            rotations[:, limbs] = torch.where(told, swing, rotations[:, limbs])
+            if known is not None:
+                swing = torch.where(known[:, ends, None, None], swing, rotations[:, limbs])
+            rotations[:, limbs] = swing
         return point._replace(rotations=rotations)
 
     def _turns(self, angles: Tensor) -> Tensor:
@@ -288,10 +267,13 @@ class Articulation(nn.Module):
 
     def bones(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the bones from each joint's parent to it in the axes of the part that carries it."""
-        scaled = self.offsets * point.scales[..., self.group].exp()[..., None]
         shifts = point.shifts.new_zeros(*point.shifts.shape[:-2], len(self.offsets), 3)
         shifts[..., list(self.shifted), :] = point.shifts
-        return scaled + shifts
+        return self._scaled(point) + shifts
+
+    def _scaled(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
+        """Return the bones of a person's lengths, without shifts."""
+        return self.offsets * point.scales[..., self.group].exp()[..., None]
 
     def joints(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the positions of all joints, metres, world axes."""
@@ -313,9 +295,7 @@ class Articulation(nn.Module):
         levers = joints[..., None, :, :] - joints[..., self.pivot, None, :]
         turned = torch.linalg.cross(axes[..., None, :].expand_as(levers), levers)
         turned = turned * self.moves[..., None]  # [..., R, J, 3]
-        scaled = (
-            carried @ (self.offsets * point.scales[..., self.group].exp()[..., None])[..., None]
-        ).squeeze(-1)
+        scaled = (carried @ self._scaled(point)[..., None]).squeeze(-1)
         by_scale = torch.einsum("bn,bg,...bi->...nig", self.path, self.in_group, scaled)
         shifted = list(self.shifted)
         by_shift = torch.einsum(

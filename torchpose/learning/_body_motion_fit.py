@@ -437,7 +437,7 @@ def _fit_poses(
     generator = torch.Generator().manual_seed(recipe.seed)
     drawn = _draw_poses(articulation, sets, recipe.n_samples, generator)
     mirror = mirror_of(articulation)
-    root = int((articulation.axis_part == 0).sum())
+    root = articulation.n_root
     index, sign = mirror.columns[root:] - root, mirror.sign[root:]
     half = GaussianMixture.fit(
         drawn,
@@ -461,7 +461,7 @@ def _draw_poses(
 
     Angles that a set does not tell are those of random poses of the sets that tell them.
     """
-    root = int((articulation.axis_part == 0).sum())
+    root = articulation.n_root
     poses = {origin: _poses(articulation, own) for origin, own in sets.items()}
     known = {o: _known_columns(articulation, own)[3 + root :] for o, own in sets.items()}
     roots = {origin: math.sqrt(len(own)) for origin, own in poses.items()}
@@ -507,7 +507,7 @@ def acceleration_ratio(motion: BodyMotion, sequences: Sequence[MotionSequence]) 
 def pose_log_density(motion: BodyMotion, sequences: Sequence[MotionSequence]) -> float:
     """Return the mean log density of recorded poses, per angle, over the angles that the sets tell."""
     body, sums, count = motion.articulation, 0.0, 0
-    root = int((body.axis_part == 0).sum())
+    root = body.n_root
     for own in _by_origin(sequences).values():
         told = _known_columns(body, own)[3 + root :].nonzero().squeeze(-1)
         poses = _poses(body, own)

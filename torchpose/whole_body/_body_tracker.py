@@ -39,7 +39,6 @@ from torchpose.whole_body._following import all_see, follow
 from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KEYPOINT_METHOD,
     KeypointBodyTracker,
-    KeypointOptions,
 )
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 
@@ -169,7 +168,7 @@ class BodyTracker(nn.Module):
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.by_keypoints = KeypointBodyTracker(
                 as_rig(cameras), fps, body=person, height=height,
-                options=KeypointOptions(keypoint_std, 1.0 if pixel_std is None else pixel_std),
+                keypoint_std=keypoint_std, pixel_std=pixel_std,
             )  # fmt: skip
             self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return

@@ -42,22 +42,14 @@ from torchpose.whole_body._keypoints.upright import Upright
 __all__ = ["BodyGaussian", "BodyKalmanFilter", "CorrectedBody"]
 
 _JITTER = (
-    1e-9  # share of a joint's information that is added along every axis, for its Cholesky factor
+    1e-9  # share of a joint's information that is added along every axis, so that it has a factor
 )
 _LEAST_INFORMATION = 1e-9  # per square metre, of joints that no camera measures
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
-_RECOVERY = (
-    100.0,
-    50.0,
-    25.0,
-    12.0,
-    6.0,
-    3.0,
-    1.5,
-    1.0,
-)  # factors of the noise where a joint has jumped
+# Factors of the noise where a joint has jumped.
+_RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
 _SCALES = (0.3, 20.0)  # factors of a camera's noise
 _SCALE_TIME = 2.0  # seconds over which they are estimated
@@ -310,7 +302,7 @@ class BodyKalmanFilter(nn.Module):
         off = (step.pulled * (G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
         fit = -0.5 * off - step.chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         after = BodyGaussian(
-            a.untwisted(point),
+            a.swung(point, joints),
             (cov + cov.mT) / 2,
             torch.logit(weighed.exchanged, _ODDS),
             self._next_scale(state.scale, frame, seen, weighed, joint_cov),

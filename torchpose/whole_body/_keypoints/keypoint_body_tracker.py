@@ -1,13 +1,13 @@
 """Track one person or several recordings through keypoints of calibrated cameras, to `BodyTrack`."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_positive, check_shape
+from torchpose._core.checks import check_choice, check_positive, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
@@ -24,30 +24,16 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
 )
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
 
-__all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker", "KeypointOptions"]
+__all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker"]
 
 KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
 _INLIER = (0.05, 0.97)  # least and largest prior probability that a keypoint is its joint's
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
-_KEYPOINT_STD_OF_ONE = (
-    0.03  # where errors of one frame are those of the next and no other camera corrects them
-)
+_KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
+_PIXEL_STD = 1.0  # pixels
 _FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
-
-
-class KeypointOptions(NamedTuple):
-    """Holds the options of tracking by keypoints.
-
-    Attributes:
-        keypoint_std: metres, how far a detector's joints are from the body's, along each axis; None is the
-            usual one.
-        pixel_std: pixels, how far they are apart from that.
-    """
-
-    keypoint_std: float | None = None
-    pixel_std: float = 1.0
 
 
 class KeypointBodyTracker(nn.Module):
@@ -56,7 +42,8 @@ class KeypointBodyTracker(nn.Module):
     Args:
         rig: the cameras. fps: frames per second. body: the person's, whose bone lengths are kept, or None.
         height: of the person, metres, or None. motion: how bodies move, the shipped one by default.
-        options: of the noise.
+        keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
+        pixel_std: pixels, how far they are apart from that; None is the usual, of both.
 
     Raises:
         InputError: values out of range. CameraError: cameras farther away than any room is large.
@@ -70,16 +57,16 @@ class KeypointBodyTracker(nn.Module):
         body: Body | None = None,
         height: float | None = None,
         motion: BodyMotion | None = None,
-        options: KeypointOptions | None = None,
+        keypoint_std: float | None = None,
+        pixel_std: float | None = None,
     ) -> None:
         super().__init__()
-        self.rig, self.fps, self.options = rig, float(fps), options or KeypointOptions()
-        for name, value in self.options._asdict().items():
-            if value is not None:
-                check_positive(name, value)
+        self.rig, self.fps = rig, float(fps)
         alone = len(rig) == 1
-        usual = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
-        self.keypoint_std = self.options.keypoint_std or usual
+        if keypoint_std is None:
+            keypoint_std = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
+        self.keypoint_std = check_positive("keypoint_std", keypoint_std)
+        self.pixel_std = check_positive("pixel_std", _PIXEL_STD if pixel_std is None else pixel_std)
         far = rig.translation.norm(dim=-1)
         if bool((far > _FARTHEST).any()):
             raise CameraError(
@@ -108,8 +95,7 @@ class KeypointBodyTracker(nn.Module):
         progress: bool = False,
     ) -> BodyTrack | list[BodyTrack]:
         """Track whole sequences; see `BodyTracker.forward`."""
-        if smoothing not in SMOOTHING:
-            raise InputError(f"smoothing must be one of {', '.join(SMOOTHING)}, got {smoothing!r}")
+        check_choice("smoothing", smoothing, SMOOTHING)
         check_shape("keypoints", keypoints, ["...", "T", len(self.rig), None, 2])
         if keypoints.ndim not in (4, 5):
             raise ShapeError(
@@ -164,7 +150,7 @@ class KeypointBodyTracker(nn.Module):
         if not bool((trust.nan_to_num(0) >= 0).all()):
             raise InputError(f"confidence must not be negative, got {float(trust.min()):g}")
         trust = trust.nan_to_num(0.0).clamp_max(1.0)
-        own = self.options.pixel_std**2 * torch.ones_like(trust)
+        own = self.pixel_std**2 * torch.ones_like(trust)
         relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
         if covariance is not None:
             own, relative = covariance.to(points), torch.zeros_like(trust)
