@@ -247,13 +247,18 @@ def test_an_unknown_rate_is_said(track, tmp_path):
         ((*MIXED, "--videos", "front.mp4"), "--videos needs one entry for each of the 3"),
         ((*MIXED, "--delays", "[1]"), "--delays needs one entry for each of the 3"),
         ((*MIXED, "--formats", "fbx"), "--formats must be one of trc, c3d, bvh"),
-        ((*MIXED, "--up", "z"), "--up is for the files of --formats"),
+        (
+            ("front.mp4", "left.mp4", "behind.mp4", "--up", "z"),
+            "--up is for keypoints and for the files",
+        ),
+        ((*MIXED, "--motion", "gone"), "gone"),
         ((*MIXED, "--smoothing", "5"), "--smoothing must be one of none, full"),
         ((*MIXED, "--keypoint-std", -1), "--keypoint-std must be positive"),
         (("front.mp4", "left.csv", "behind.npz"), "--detector finds the keypoints in videos"),
         (("gone", "left.csv", "behind.npz"), "and is not there"),
         (("front.mp4", "left.mp4", "behind.mp4", "--method", "kalman"), "takes keypoints"),
         (("front.mp4", "left.mp4", "behind.mp4", "--smoothing", "full"), "is for keypoints"),
+        (("front.mp4", "left.mp4", "behind.mp4", "--motion", "whole-body"), "is for keypoints"),
     ],
 )
 def test_what_does_not_go_together_is_refused(track, tmp_path, words, said):

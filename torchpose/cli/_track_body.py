@@ -52,7 +52,7 @@ _OF_SILHOUETTES = (
     "background", "ignore_still", "initial_pose", "facing", "rows", "sharpness", "manifold",
     "conditionals", "action", "n_particles",
 )  # fmt: skip
-_OF_KEYPOINTS = ("smoothing", "videos", "keypoint_std", "pixel_std", "min_confidence")
+_OF_KEYPOINTS = ("smoothing", "videos", "keypoint_std", "pixel_std", "motion", "min_confidence")
 _BY_KEYPOINTS = "kalman"
 
 
@@ -71,7 +71,7 @@ def command() -> Command:
         run,
         _EXAMPLES,
         {
-            "tracker": options_of(BodyTracker, ("cameras", "method", "fps")),
+            "tracker": options_of(BodyTracker, ("cameras", "method", "fps", "up")),
             "method_options": _method_options(),
         },
         spaced=("inputs", "background", "videos", "formats"),
@@ -165,8 +165,8 @@ def run(
         delays: the number of frames by which each input began too early (default none).
         seed: the seed of the filter; kalman has none.
         formats: also write the poses as body.trc, body.c3d or body.bvh.
-        up: with --formats: the axis of the cameras' world that points up; the files then have y up. By
-            default they have the axes of the world.
+        up: the axis of the cameras' world that points up: by keypoints people are expected upright along
+            it, and the files of --formats have y up. By default they have the axes of the world.
         overlay: write a video per camera with the body drawn into it.
         pictures: write overlay.png, and of keypoints skeleton.png.
         given: the command.
@@ -232,7 +232,8 @@ def _run_on_keypoints(
     detector = None
     if values["detector"] is not None:
         detector = DetectorSettings(values["detector"], values["min_confidence"])
-    arguments = {name: tracker[name] for name in ("body", "height", "keypoint_std", "pixel_std")}
+    names = ("body", "height", "keypoint_std", "pixel_std", "motion")
+    arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
     settings = KeypointSettings(
         detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments
     )
@@ -262,6 +263,10 @@ def _refuse_others(given: Given, by_keypoints: bool) -> None:
     for key in refused:
         if given.values[key] != given.defaults[key]:
             raise InputError(f"--{key.replace('_', '-')} is for {why} {there}; leave it out")
+    if not by_keypoints and given.values["up"] is not None and not given.values["formats"]:
+        raise InputError(
+            "--up is for keypoints and for the files of --formats; the other results are in world axes"
+        )
     if by_keypoints and detector is None and given.values["min_confidence"] is not None:
         raise InputError(
             "--min-confidence is for --detector; confidences of files count as they are"
@@ -288,8 +293,6 @@ def _check(values: dict[str, Any]) -> None:
             )
     for kind in values["formats"] or ():
         check_choice("--formats", kind, BODY_FORMATS)
-    if values["up"] is not None and not values["formats"]:
-        raise InputError("--up is for the files of --formats; the other results are in world axes")
 
 
 def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[PinholeCamera]":

@@ -21,8 +21,10 @@ from torchpose.errors import InputError, NobodySeenError
 from torchpose.filters._measurements import check_lengths
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
 from torchpose.whole_body._filter_table import (
     LEARNT,
@@ -103,6 +105,10 @@ class BodyTracker(nn.Module):
             four times those.
         keypoint_std: of "kalman", how far a detector's joints are from the body's, metres along each axis;
             keypoints of low confidence are farther. pixel_std: the same in pixels, on top of it.
+        motion: of "kalman", how bodies move, a name that `torchpose info` lists, or a file of `torchpose
+            fit body`; in Python also the `BodyMotion` itself.
+        up: of "kalman", "y" or "z", the axis of the world that points up; people are then expected upright.
+            By default one camera is taken to be about level, and of several nothing is expected.
         **options: the options of the method's filter (`torchpose.whole_body._filter_table.method_options`),
             such as sharpness, limits, leg_swap or n_layers.
 
@@ -148,6 +154,8 @@ class BodyTracker(nn.Module):
         initial_cov: Tensor | None = None,
         keypoint_std: float | None = None,
         pixel_std: float | None = None,
+        motion: BodyMotion | str | Path | None = None,
+        up: str | None = None,
         **options: Unpack[BodyTrackerOptions],
     ) -> None:
         super().__init__()
@@ -168,13 +176,18 @@ class BodyTracker(nn.Module):
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.by_keypoints = KeypointBodyTracker(
                 as_rig(cameras), fps, body=person, height=height,
-                keypoint_std=keypoint_std, pixel_std=pixel_std,
+                motion=load_body_motion(motion) if isinstance(motion, str | Path) else motion,
+                keypoint_std=keypoint_std, pixel_std=pixel_std, up=up,
             )  # fmt: skip
             self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return
-        if keypoint_std is not None or pixel_std is not None:
+        alone = {
+            "keypoint_std": keypoint_std, "pixel_std": pixel_std, "motion": motion, "up": up,
+        }  # fmt: skip
+        unused = [name for name, value in alone.items() if value is not None]
+        if unused:
             raise InputError(
-                f"keypoint_std and pixel_std do nothing without method={KEYPOINT_METHOD!r}"
+                f"{', '.join(unused)} does nothing without method={KEYPOINT_METHOD!r}; leave it out"
             )
         height = _HEIGHT if height is None else height
         self.method = choose_method(method, given)

@@ -14,9 +14,11 @@ from torchpose.errors import (
     CameraError,
     InputError,
     NobodySeenError,
+    PriorError,
     ShapeError,
     SkeletonError,
 )
+from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body import BodyTrack, BodyTracker
 
 J = BODY_15.joint
@@ -83,6 +85,40 @@ def test_one_camera_tells_the_pose_up_to_size():
     assert float((pixels - one.keypoints).norm(dim=-1)[5:].median()) < 15
     assert not any("how large" in note for note in found.notes)
     assert any("how large" in note for note in track(one).notes)
+
+
+def test_covariances_of_one_camera_have_what_frames_do_not_average_out():
+    one = scene(1, 10)
+    least = torch.linalg.eigvalsh(track(one).covariance3d)[..., 0]
+    assert float(least.min()) >= (2 / 3 * 0.03) ** 2
+
+
+def test_who_is_upright_is_seen_so_where_up_is_known():
+    """The camera looks down, and is taken for about level where nothing is said."""
+    joints, rig = moving_body(20), ring(1)
+    pixels = rig(joints).pixels
+
+    def lean(**options) -> float:
+        found = tracker(rig, **options)(keypoints=pixels).joints3d[10:]
+        trunk = (found[:, J("neck")] - found[:, J("pelvis")]).mean(0)
+        return float(torch.acos(trunk[1] / trunk.norm()))
+
+    assert lean(up="y") < 0.12
+    assert lean(up="y") < lean(up="z")
+    with pytest.raises(InputError, match="up must be one of"):
+        tracker(rig, up="x")
+
+
+def test_a_motion_is_taken_by_its_name_or_as_it_is(four, filtered):
+    few = four.keypoints[:5]
+    by_name = tracker(four.rig, motion="whole-body")(keypoints=few, confidence=four.confidence[:5])
+    itself = tracker(four.rig, motion=load_body_motion("whole-body"))(
+        keypoints=few, confidence=four.confidence[:5]
+    )
+    assert torch.equal(by_name.joints3d, filtered.joints3d[:5])
+    assert torch.equal(itself.joints3d, filtered.joints3d[:5])
+    with pytest.raises(PriorError):
+        tracker(four.rig, motion="no such motion")
 
 
 # --- faults -----------------------------------------------------------------------------------------
@@ -279,6 +315,8 @@ def test_other_methods_take_no_keypoints(four):
         BodyTracker(four.rig, "apf")(keypoints=four.keypoints)
     with pytest.raises(InputError, match="kalman"):
         BodyTracker(four.rig, "apf", keypoint_std=0.01)
+    with pytest.raises(InputError, match="motion, up"):
+        BodyTracker(four.rig, "apf", motion="whole-body", up="y")
 
 
 def test_the_tracker_is_at_the_top():

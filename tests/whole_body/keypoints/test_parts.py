@@ -18,6 +18,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     weigh,
 )
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_height
 from torchpose.whole_body._keypoints.upright import camera_up
 
@@ -146,3 +147,32 @@ def test_one_camera_fixes_limbs_and_leaves_the_prior_alone(motion):
     assert float(std[motion.articulation.groups.index("neck")]) == pytest.approx(0.1)
     assert float(one.pull_time) < float(motion.pull_time)
     torch.testing.assert_close(motion.scale_cov, before)
+
+
+def test_hypotheses_are_output_as_one_gaussian_with_their_mean_and_spread(motion):
+    tracker = KeypointTracker(ring(1), 30.0, motion)
+    given = scene(1, 2)
+    stream, _, _ = tracker.advance(None, frame_of(given))
+    frame = frame_of(given, 1)
+    after, pose, merged = tracker.advance(stream, frame)
+    weights = after.log_weights[0].softmax(-1)
+    places, covs = after.state.mean.position, after.state.cov[:, :3, :3]
+    mean = weights @ places
+    off = places - mean
+    cov = (weights[:, None, None] * (covs + off[:, :, None] * off[:, None])).sum(0)
+    assert len(weights) > 1 and float(weights.max()) < 0.99
+    torch.testing.assert_close(merged.state.mean.position[0], mean)
+    torch.testing.assert_close(merged.state.cov[0, :3, :3], cov)
+    torch.testing.assert_close(pose.joints[0, J("pelvis")], mean)
+
+
+def test_constants_move_with_the_filter(motion):
+    def tensors(value):
+        if isinstance(value, torch.Tensor):
+            return [value]
+        return [t for part in value for t in tensors(part)] if isinstance(value, tuple) else []
+
+    filter = KeypointTracker(ring(1), 30.0, load_body_motion("whole-body")).to("meta").filter
+    found = [t for value in vars(filter).values() for t in tensors(value)]
+    found += list(filter.buffers())
+    assert len(found) > 20 and {t.device.type for t in found} == {"meta"}

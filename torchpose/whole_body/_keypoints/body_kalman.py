@@ -14,7 +14,7 @@ with H the derivative of the joints and W, b the information of all keypoints ab
 Cholesky factors of I + L^T G L.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -151,6 +151,13 @@ class BodyKalmanFilter(nn.Module):
         self.exchange = exchange_of(self.articulation.skeleton)
         self.transition = transition(motion, 1 / fps)
         self._jump_variance = jump_variance(motion)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move constants with the buffers, as `to` asks for."""
+        super()._apply(fn, recurse)
+        for name in ("maps", "upright", "exchange", "transition", "_jump_variance"):
+            setattr(self, name, _mapped(getattr(self, name), fn))
+        return self
 
     def predict(self, state: BodyGaussian) -> BodyGaussian:
         """Return the Gaussian one frame later."""
@@ -335,6 +342,15 @@ class BodyKalmanFilter(nn.Module):
         doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
+
+
+def _mapped(value: Any, fn: Callable[[Tensor], Tensor]) -> Any:
+    """Return a tensor, or a named tuple with tensors, with a function applied to every tensor."""
+    if isinstance(value, Tensor):
+        return fn(value)
+    if not isinstance(value, tuple):
+        return value
+    return type(value)(*(_mapped(part, fn) for part in value))  # type: ignore[arg-type]
 
 
 def _taken(value: Any, index: Tensor) -> Any:

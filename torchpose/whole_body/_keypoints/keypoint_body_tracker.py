@@ -23,6 +23,7 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointTracker,
 )
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
+from torchpose.whole_body._keypoints.upright import known_up
 
 __all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker"]
 
@@ -32,6 +33,7 @@ _INLIER = (0.05, 0.97)  # least and largest prior probability that a keypoint is
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
+_LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
 _PIXEL_STD = 1.0  # pixels
 _FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
 
@@ -44,6 +46,7 @@ class KeypointBodyTracker(nn.Module):
         height: of the person, metres, or None. motion: how bodies move, the shipped one by default.
         keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
         pixel_std: pixels, how far they are apart from that; None is the usual, of both.
+        up: "y" or "z", the axis of the world that points up, if it is known.
 
     Raises:
         InputError: values out of range. CameraError: cameras farther away than any room is large.
@@ -59,6 +62,7 @@ class KeypointBodyTracker(nn.Module):
         motion: BodyMotion | None = None,
         keypoint_std: float | None = None,
         pixel_std: float | None = None,
+        up: str | None = None,
     ) -> None:
         super().__init__()
         self.rig, self.fps = rig, float(fps)
@@ -81,7 +85,9 @@ class KeypointBodyTracker(nn.Module):
         if alone:
             motion = of_one_camera(motion, body is None)
         self.sized = body is not None or height is not None
-        self.tracker = KeypointTracker(rig, self.fps, motion)
+        lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
+        known = None if up is None else known_up(rig, up)
+        self.tracker = KeypointTracker(rig, self.fps, motion, upright=known, lasting_std=lasting)
 
     @torch.no_grad()
     def forward(

@@ -1,10 +1,11 @@
 """Track bodies through keypoints: begin, filter, begin anew where a person was lost, smooth."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -25,6 +26,10 @@ __all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
 
 _LEAST_JOINTS = 6  # that are measured where tracking begins
 _HYPOTHESES = 16  # that are tracked from one camera, which does not see the depth of limbs
+_SHARE = (
+    0.1  # of a frame's evidence about hypotheses: its errors are like those of the frames before
+)
+_KEPT = 0.3  # seconds over which evidence about hypotheses is summed up
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 
@@ -35,14 +40,13 @@ class KeypointStream(NamedTuple):
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
         begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
-            been of something else. best: [B], the likeliest hypothesis.
+            been of something else.
     """
 
     state: BodyGaussian
     log_weights: Tensor
     begun: Tensor
     lost: Tensor
-    best: Tensor
 
 
 class KeypointPoses(NamedTuple):
@@ -73,6 +77,8 @@ class KeypointTracker(nn.Module):
     Args:
         rig: the cameras. fps: frames per second. motion: how bodies move. n_iterations: of a correction.
         upright: how people lean, if it is known which way is up; with one camera, this is taken to be level.
+        lasting_std: metres, of what is wrong with joints for so long that frames do not average it out, along
+            each axis; covariances of joints have it on top.
     """
 
     def __init__(
@@ -82,8 +88,10 @@ class KeypointTracker(nn.Module):
         motion: BodyMotion,
         n_iterations: int = 3,
         upright: Upright | None = None,
+        lasting_std: float = 0.0,
     ) -> None:
         super().__init__()
+        self.lasting_std = lasting_std
         if upright is None and len(rig) == 1:
             upright = camera_up(rig)
         self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
@@ -98,18 +106,16 @@ class KeypointTracker(nn.Module):
             frames: [B, T, C, J, ...]. smoothing: whether later frames count too. progress: show a bar.
         """
         n_frames = frames.pixels.shape[1]
-        stream, poses, corrected, joined = None, [], [], []
+        stream: KeypointStream | None = None
+        poses, corrected = [], []
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
             frame = KeypointFrame(*(value[:, t] for value in frames))
-            before: KeypointStream | None = stream
             stream, pose, found = self.advance(stream, frame)
             poses.append(pose)
             if smoothing:
                 corrected.append(found)
-                other = pose.started if before is None else stream.best != before.best
-                joined.append(pose.started | other)
         filtered = _stacked(poses)
-        return self._smoothed(filtered, corrected, torch.stack(joined)) if smoothing else filtered
+        return self._smoothed(filtered, corrected) if smoothing else filtered
 
     def advance(
         self, stream: KeypointStream | None, frame: KeypointFrame
@@ -117,7 +123,7 @@ class KeypointTracker(nn.Module):
         """Track one more frame; the first one begins where there is no stream yet.
 
         Returns:
-            The next stream, the poses of the frame [B, ...], and the corrected likeliest hypotheses.
+            The next stream, the poses of the frame [B, ...], and the corrected hypotheses as one Gaussian.
         """
         n_joints = (frame.inlier > 0).any(-2).sum(-1)
         enough = n_joints >= _LEAST_JOINTS
@@ -130,12 +136,11 @@ class KeypointTracker(nn.Module):
             due = enough & (~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps))
             if bool(due.any()):
                 stream, found = self._begun_anew(stream, found, frame, due)
-        stream = stream._replace(best=stream.log_weights.argmax(-1))
-        chosen = found.take(self._rows(stream))
+        chosen = self._merged(stream, found)
         inlier = chosen.weighed.own + chosen.weighed.other
         stream = stream._replace(lost=self._lost(stream, frame, chosen.weighed))
         pose = KeypointPoses(
-            chosen.joints, chosen.joint_cov, chosen.state.mean, chosen.state.cov, inlier,
+            chosen.joints, self._lasting(chosen.joint_cov), chosen.state.mean, chosen.state.cov, inlier,
             chosen.weighed.exchanged, chosen.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough,
         )  # fmt: skip
@@ -149,7 +154,8 @@ class KeypointTracker(nn.Module):
         count, n_each = stream.log_weights.shape
         every = torch.arange(count, device=frame.pixels.device).repeat_interleave(n_each)
         found = self.filter.correct(self.filter.predict(stream.state), frame.take(every))
-        weights = stream.log_weights + found.log_evidence.view(count, n_each)
+        told = _SHARE * found.log_evidence.view(count, n_each)
+        weights = math.exp(-1 / (_KEPT * self.filter.fps)) * stream.log_weights + told
         weights = weights - weights.amax(-1, keepdim=True)
         stream = stream._replace(state=found.state, log_weights=weights)
         return stream, found
@@ -160,8 +166,8 @@ class KeypointTracker(nn.Module):
         count = len(weights)
         zero = weights.new_zeros(count)
         begun = torch.ones(count, dtype=torch.bool, device=weights.device)
-        best = torch.zeros_like(begun, dtype=torch.long)
-        return KeypointStream(found.state, weights - weights[:, :1], begun, zero, best), found
+        weights = _SHARE * (weights - weights[:, :1])
+        return KeypointStream(found.state, weights, begun, zero), found
 
     def _begun_anew(
         self,
@@ -180,14 +186,33 @@ class KeypointTracker(nn.Module):
             stream.log_weights.index_copy(0, persons, new.log_weights),
             stream.begun | due,
             torch.where(due, 0.0, stream.lost),
-            stream.best,
         )
         return stream, found.put(rows, new_found)
 
-    def _rows(self, stream: KeypointStream) -> Int[Tensor, " B"]:
-        """Return the rows of the likeliest hypotheses."""
+    def _merged(self, stream: KeypointStream, found: CorrectedBody) -> CorrectedBody:
+        """Return the Gaussian with the mean and covariance of all hypotheses, in the likeliest one's tangent.
+
+        d = sum_m w_m (x_m - x),   P = sum_m w_m (P_m + (x_m - x - d) (x_m - x - d)^T).
+        """
         count, n_each = stream.log_weights.shape
-        return torch.arange(count, device=stream.best.device) * n_each + stream.best
+        if n_each == 1:
+            return found
+        body, first = self.filter.articulation, torch.arange(count, device=stream.lost.device)
+        best = first * n_each + stream.log_weights.argmax(-1)
+        chosen = found.take(best)
+        middle = chosen.state.mean.map(lambda value: value.repeat_interleave(n_each, 0))
+        weights = stream.log_weights.softmax(-1)[..., None]
+        steps = body.difference(found.state.mean, middle).unflatten(0, (count, n_each))
+        step = (weights * steps).sum(1)
+        off = weights.sqrt() * (steps - step[:, None])
+        covs = found.state.cov.unflatten(0, (count, n_each))
+        cov = (weights[..., None] * covs).sum(1) + off.mT @ off
+        point = body.moved(chosen.state.mean, step)
+        point = body.swung(point, body.joints(point))
+        joints, jacobian = body.linearise(point)
+        joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
+        state = chosen.state._replace(mean=point, cov=(cov + cov.mT) / 2)
+        return chosen._replace(state=state, joints=joints, joint_cov=joint_cov)
 
     def _lost(
         self, stream: KeypointStream, frame: KeypointFrame, weighed: Weighed
@@ -210,17 +235,22 @@ class KeypointTracker(nn.Module):
         self,
         filtered: KeypointPoses,
         corrected: Sequence[CorrectedBody],
-        joined: Bool[Tensor, "T B"],
     ) -> KeypointPoses:
-        """Return poses for which later frames count too, up to where another hypothesis took over."""
+        """Return poses for which later frames count too, up to where tracking began anew."""
         widened = torch.stack([found.widened for found in corrected])
         states = [found.state for found in corrected]
-        result = smooth(self.filter, states, widened, joined)
+        result = smooth(self.filter, states, widened, filtered.started.mT)
         point = result.mean.map(lambda value: value.transpose(0, 1))
         cov = result.cov.transpose(0, 1)
         joints, jacobian = self.filter.articulation.linearise(point)
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
-        return filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
+        return filtered._replace(
+            joints=joints, covariance=self._lasting(joint_cov), point=point, state_cov=cov
+        )
+
+    def _lasting(self, joint_cov: Float[Tensor, "*batch J 3 3"]) -> Float[Tensor, "*batch J 3 3"]:
+        """Return covariances of joints with what frames do not average out."""
+        return joint_cov + self.lasting_std**2 * torch.eye(3).to(joint_cov)
 
 
 def _stacked(poses: Sequence[Any]) -> Any:

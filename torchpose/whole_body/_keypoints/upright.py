@@ -5,10 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.camera._rig import CameraRig
+from torchpose.whole_body._body_files import UP_AXES
 
-__all__ = ["Lean", "Upright", "camera_up"]
+__all__ = ["Lean", "Upright", "camera_up", "known_up"]
 
 # Of the upward direction in the axes of the pelvis, to the left and forward, rounded from recordings.
 _MEAN, _STD = (0.0, -0.1), (0.1, 0.25)
@@ -49,3 +51,15 @@ def camera_up(rig: CameraRig) -> Upright:
     direction = -rig.rotation[0, 1]
     std, tilt = (torch.tensor(values).to(direction) for values in (_STD, _TILT))
     return Upright(direction, torch.tensor(_MEAN).to(direction), std.square() + tilt.square())
+
+
+def known_up(rig: CameraRig, up: str) -> Upright:
+    """Return what is expected where an axis of the world is known to point up.
+
+    Raises:
+        InputError: an axis other than "y" and "z".
+    """
+    check_choice("up", up, UP_AXES)
+    direction = torch.eye(3).to(rig.translation)["xyz".index(up)]
+    mean, std = (torch.tensor(values).to(direction) for values in (_MEAN, _STD))
+    return Upright(direction, mean, std.square())
