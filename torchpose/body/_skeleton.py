@@ -373,6 +373,7 @@ _SPELLINGS = {  # canonical names that may stand for a joint, the best one first
     "ankle": ("ankle", "foot"),
 }
 _MIDDLES = {"pelvis": ("left_hip", "right_hip"), "neck": ("left_shoulder", "right_shoulder")}
+_FACE = (("ear_left", "ear_right"), ("eye_left", "eye_right"), ("nose",))  # the best one first
 _NEEDED = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
@@ -385,7 +386,8 @@ def body_joints(
     ends) and 23, pose2sim's 21, Kinect v1 20 and v2 25, and any other set with the same names. The
     neck is the low one (CMU lowerneck, v2 SpineShoulder, MHAD neck, HumanEva thorax) where there
     is a choice, since it moves least against the shoulders. Without a pelvis or a neck, the middle
-    of hips or shoulders stands for it.
+    of hips or shoulders stands for it, and without a head that of the ears (of the one that is known: then
+    a camera sees the head from the side), of the eyes, or the nose.
 
     Args:
         joints: [..., K, C], metres (C = 3) or pixels (C = 2), in any axes.
@@ -413,7 +415,22 @@ def body_joints(
         if found[BODY_15.joint(joint)] is None:
             both = picked[BODY_15.joint(left)], picked[BODY_15.joint(right)]
             picked[BODY_15.joint(joint)] = (both[0] + both[1]) / 2
+    if found[BODY_15.joint("head")] is None:
+        picked[BODY_15.joint("head")] = _face(joints, canonical)
     return torch.stack(picked, -2)
+
+
+def _face(
+    joints: Float[Tensor, "*batch K C"], canonical: Sequence[str]
+) -> Float[Tensor, "*batch C"]:
+    """Return the middle of the best known pair of points of the face, NaN where there is none."""
+    middle = torch.full_like(joints[..., 0, :], torch.nan)
+    for pair in _FACE:
+        points = [canonical.index(name) for name in pair if name in canonical]
+        if points:
+            unknown = middle[..., :2].isnan().any(-1, keepdim=True)
+            middle = torch.where(unknown, joints[..., points, :].nanmean(-2), middle)
+    return middle
 
 
 def _find(joint: str, canonical: Sequence[str]) -> int | None:

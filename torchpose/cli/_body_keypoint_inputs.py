@@ -201,7 +201,8 @@ def _of_body(
     there = torch.isfinite(points).all(-1)
     trust = there.to(points) if confidence is None else confidence.to(points)
     given = count_given(names)
-    table = torch.cat([points, trust[..., None]], -1)[..., :given, :]
+    table = torch.cat([points, trust[..., None]], -1)
+    table = table.masked_fill(~(there & (trust > 0))[..., None], torch.nan)[..., :given, :]
     try:
         joints = body_joints(table, names[:given])
     except SkeletonError as error:

@@ -226,6 +226,37 @@ def test_a_joint_set_in_another_order_and_without_a_pelvis(four, filtered):
     assert float(away[:, J("left_wrist")].max()) < 0.01
 
 
+def test_a_face_tells_where_the_head_is():
+    """COCO's joints have no head: without ears and nose the prior alone would say where it is."""
+    given, names = scene(3, 30), [n for n in NAMES if n not in ("head", "neck", "pelvis")]
+    joints = given.joints.clone()
+    body = Body.of_height(BODY_15, 1.7)
+    state = torch.zeros(len(joints), body.dim, dtype=torch.float64)
+    state[:, 3 + 3 * BODY_15.parts.index("head")] = 0.35  # bent forward
+    head = body.joints(state)[:, J("head")] - body.joints(state)[:, J("neck")]
+    joints[:, J("head")] = joints[:, J("neck")] + head
+    side = torch.nn.functional.normalize(
+        joints[:, J("left_hip")] - joints[:, J("right_hip")], dim=-1
+    )
+    ears = [joints[:, J("head")] + sign * 0.075 * side for sign in (1, -1)]
+    points = torch.stack([*(joints[:, J(n)] for n in names), *ears], 1)
+    pixels = given.rig(points).pixels
+    confidence = torch.ones_like(pixels[..., 0])
+    pixels[:, 0, -1], confidence[:, 0, -1] = (
+        0.0,
+        0.0,
+    )  # hidden from a camera: zeros, as detectors write
+
+    def off(wanted: list[str]) -> float:
+        columns = [[*names, "left_ear", "right_ear"].index(n) for n in wanted]
+        found = tracker(given.rig)(
+            keypoints=pixels[:, :, columns], confidence=confidence[:, :, columns], names=wanted
+        )
+        return float((found.joints3d - joints)[10:, J("head")].norm(dim=-1).mean())
+
+    assert off([*names, "left_ear", "right_ear"]) < 0.04 < 0.06 < off(names)
+
+
 def test_distorted_keypoints_are_undistorted(four):
     import cv2
 

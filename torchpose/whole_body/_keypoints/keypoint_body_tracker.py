@@ -165,7 +165,7 @@ class KeypointBodyTracker(nn.Module):
         there = torch.isfinite(points).all(-1) & (trust > 0)
         inlier = torch.where(there, trust.clamp(*_INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
-        table = body_joints(table, names)
+        table = body_joints(table.masked_fill(~there[..., None], torch.nan), names)
         pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
         self._check_inside(pixels)
         pixels = self.rig.undistort_points(pixels).nan_to_num()
