@@ -60,6 +60,11 @@ def right():
 
 
 @pytest.fixture(scope="module")
+def tracked(right):
+    return track(right)
+
+
+@pytest.fixture(scope="module")
 def in_step(late):
     return track(late, refine="delays")
 
@@ -75,7 +80,7 @@ def test_delays_are_found(late, in_step):
         delays[0], torch.tensor([0.0, 3.0, 1.5], dtype=torch.float64), atol=0.2, rtol=0
     )
     assert (std[0, 1:] > 0).all() and (std[0, 1:] < 0.3).all()
-    assert mean_error(found, late) < 0.5 * mean_error(track(late), late)
+    assert mean_error(found, late) < 0.01
     assert any("c1 began 3.0" in note and "earlier than c0" in note for note in found.notes)
 
 
@@ -84,7 +89,8 @@ def test_whole_frames_are_found_from_pairs_of_cameras():
     ones = given.confidence
     frames = KeypointFrame(given.keypoints, ones, 0 * ones, ones)
     assert coarse_delays(given.rig, frames, 8).tolist() == [0, 5, -4]
-    moved = shifted(frames, torch.tensor([0, 5, -4]))
+    moved, by = shifted(frames, torch.tensor([0, 5, -4]))
+    assert by[10].tolist() == [0, 5, -4] and by[-1].tolist() == [0, 0, -4]
     torch.testing.assert_close(moved.pixels[10, 1], given.keypoints[15, 1])
     assert not moved.inlier[-5:, 1].any() and moved.inlier[:-5, 1].all()
     assert not moved.inlier[:4, 2].any()
@@ -93,18 +99,16 @@ def test_whole_frames_are_found_from_pairs_of_cameras():
 # --- poses ------------------------------------------------------------------------------------------
 
 
-def test_a_turned_and_shifted_camera_is_corrected(right):
+def test_a_turned_and_shifted_camera_is_corrected(right, tracked):
     rig = disturbed(right.rig, 1, 1.0, 0.03)
-    wrong, best = track(right, rig), track(right)
+    wrong, best = track(right, rig), tracked
     found = track(right, rig, refine="extrinsics")
     assert mean_error(found, right) < 0.6 * mean_error(wrong, right)
     apart = [_apart_of_one_motion(x.joints3d, right.joints) for x in (found, best, wrong)]
     assert apart[0] < apart[1] + 0.0003 < apart[2]
-    given = rotvec_to_matrix(found.details["camera_rotation"][0])
     turned = rotvec_to_matrix(found.details["camera_rotation"][0]) @ right.rig.rotation.mT
     angle = torch.rad2deg(torch.arccos(((turned[1].trace() - 1) / 2).clamp(-1, 1)))
     assert float(angle) < 0.6
-    torch.testing.assert_close(given @ given.mT, torch.eye(3, dtype=torch.float64).expand(3, 3, 3))
 
 
 def _apart_of_one_motion(joints, truth) -> float:
@@ -140,16 +144,16 @@ def test_a_rotation_leaves_a_camera_in_its_place(right):
 # --- what is right, and what nobody asked for ---------------------------------------------------------
 
 
-def test_right_cameras_stay_and_nothing_is_said(right):
+def test_right_cameras_stay_and_nothing_is_said(right, tracked):
     found = track(right, refine="both")
     assert not found.details["camera_delays"].any()
     torch.testing.assert_close(
         found.details["camera_translation"][0], right.rig.translation, atol=1e-12, rtol=0
     )
-    torch.testing.assert_close(found.joints3d, track(right).joints3d)
+    torch.testing.assert_close(found.joints3d, tracked.joints3d)
     assert any("cameras as given" in note for note in found.notes)
     assert not any("seems" in note or "degrees" in note for note in found.notes)
-    assert not track(right).notes
+    assert not tracked.notes
 
 
 def test_notes_say_what_was_not_asked_for(right):

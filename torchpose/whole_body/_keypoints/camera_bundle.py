@@ -37,8 +37,8 @@ __all__ = [
     "ROTATION_STD",
     "SHIFT_STD",
     "Adjusted",
+    "BundleInputs",
     "CameraErrors",
-    "Given",
     "adjust",
     "by_pose",
     "corrected_pose",
@@ -75,7 +75,7 @@ class CameraErrors(NamedTuple):
         return self.cov.diagonal().clamp_min(0).sqrt().view_as(self.values)
 
 
-class Given(NamedTuple):
+class BundleInputs(NamedTuple):
     """Holds what cameras are adjusted to.
 
     Attributes:
@@ -125,7 +125,9 @@ def corrected_pose(
     return turn @ rig.rotation, (turn @ rig.translation[..., None]).squeeze(-1) + values[:, 3:6]
 
 
-def adjust(rig: CameraRig, given: Given, start: CameraErrors, widths: Sequence[float]) -> Adjusted:
+def adjust(
+    rig: CameraRig, given: BundleInputs, start: CameraErrors, widths: Sequence[float]
+) -> Adjusted:
     """Return the errors of cameras after a step of Gauss and Newton for every width of the noise.
 
     Args:
@@ -154,7 +156,7 @@ def adjust(rig: CameraRig, given: Given, start: CameraErrors, widths: Sequence[f
     return Adjusted(CameraErrors(values, cov), float(spent + narrowed))
 
 
-def _information(given: Given) -> Float[Tensor, " C7"]:
+def _information(given: BundleInputs) -> Float[Tensor, " C7"]:
     """Return the information of the prior about errors."""
     std = [ROTATION_STD] * 3 + [SHIFT_STD] * 3 + [given.delay_std]
     return torch.tensor(std).to(given.joints).square().reciprocal().repeat(len(given.free))
@@ -162,7 +164,7 @@ def _information(given: Given) -> Float[Tensor, " C7"]:
 
 def _equations(
     rig: CameraRig,
-    given: Given,
+    given: BundleInputs,
     values: Tensor,
     joints: Tensor,
     joint_cov: Tensor | None,
@@ -226,7 +228,10 @@ def _seen(
 
 
 def _covariance(
-    given: Given, g: Float[Tensor, "T J N"], prior: Float[Tensor, " N"], L: Float[Tensor, "N N"]
+    given: BundleInputs,
+    g: Float[Tensor, "T J N"],
+    prior: Float[Tensor, " N"],
+    L: Float[Tensor, "N N"],
 ) -> Float[Tensor, "N N"]:
     """Return the covariance of errors, S^-1 (sum_b g_b g_b^T + L) S^-1, b joints over a second.
 

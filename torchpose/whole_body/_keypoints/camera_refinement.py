@@ -19,8 +19,8 @@ from torch import Tensor
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._keypoints.camera_bundle import (
     N_ERRORS,
+    BundleInputs,
     CameraErrors,
-    Given,
     adjust,
     corrected_pose,
 )
@@ -48,6 +48,10 @@ _LONGEST, _LEAST_LONGEST = 0.3, 10  # seconds, and frames at least, of a delay t
 _DELAY_STD = 0.2  # seconds
 _BLOCK = 1.0  # seconds within which errors of a joint's keypoints go together
 _ROUNDS = 5  # of tracking and adjusting, at most
+_BEYOND = (
+    0.5  # factor of the trust in keypoints that stand for those before the first or after the last
+)
+_MARGIN = 20.0  # log-evidence of other keypoints in a frame
 _SETTLED = 0.2  # standard deviations by which no error changes any more
 _WIDTHS = (50.0, 25.0, 12.0, 6.0, 3.0, 1.5, *[1.0] * 6)
 
@@ -109,11 +113,11 @@ def refine_cameras(
         if bool((change <= _SETTLED * errors.std).all()):
             break
     assert adjusted is not None
-    moved = _in_time(rig, frames, errors.values, poses)
     better = _corrected(rig, errors.values)
-    after = track(better, moved, smoothing)
-    gain = _gain(frames, before, moved, after, errors.values[:, DELAY]) - adjusted.price
+    after = track(better, _in_time(rig, frames, errors.values, poses), smoothing)
+    gain = _gain(frames, before, after, errors.values[:, DELAY].round()) - adjusted.price
     if gain > 0:
+        moved = _in_time(rig, frames, errors.values, poses)
         return RefinedCameras(errors, better, moved, after, gain, kept=False)
     before = before if smoothing else track(rig, frames, False)
     same = CameraErrors(torch.zeros_like(errors.values), errors.cov)
@@ -148,7 +152,7 @@ def given_for(
     fps: float,
     exchange: Exchange,
     stride: int = 1,
-) -> Given:
+) -> BundleInputs:
     """Return what cameras are adjusted to: every frame, or each after a stride.
 
     Args:
@@ -156,11 +160,11 @@ def given_for(
         free: which errors are estimated. fps: frames per second. exchange: of sides.
     """
     shifts = delays.round()
-    moved = shifted(frames, shifts.long())
+    moved, _ = shifted(frames, shifts.long())
     if stride > 1:
         moved = KeypointFrame(*(value[::stride] for value in moved))
     block = max(1, round(_BLOCK * fps / stride))
-    return Given(
+    return BundleInputs(
         moved, joints[::stride], _velocities(joints)[::stride], shifts, free, _DELAY_STD * fps,
         block, exchange,
     )  # fmt: skip
@@ -191,18 +195,18 @@ def _in_time(
 ) -> KeypointFrame:
     """Return keypoints in time with the first camera.
 
-    They are those of the nearest frame, moved by the velocity of their joints for the rest of the delay,
-    z + A v (d - round d). So none are averaged, which would make their noise look smaller than it is.
+    They are those of the nearest frame that there is, moved by the velocity of their joints for the rest of
+    the delay, z + A v (d - round d). None are averaged, which would make their noise look smaller.
     """
     delays = values[:, DELAY]
-    moved = shifted(frames, delays.round().long())
+    moved, shifts = shifted(frames, delays.round().long(), _BEYOND)
     if poses is None:
         return moved
     joints = poses.joints[0]
     seen = see(RigMaps.of(_corrected(rig, values)), joints)
     by_frame = (seen.by_joint @ _velocities(joints)[:, None, ..., None]).squeeze(-1)
-    rest = (delays - delays.round())[:, None, None]
-    return moved._replace(pixels=moved.pixels + rest * by_frame)
+    rest = delays - shifts
+    return moved._replace(pixels=moved.pixels + rest[..., None, None] * by_frame)
 
 
 def free_errors(count: int, what: str) -> Bool[Tensor, "C 7"]:
@@ -214,19 +218,16 @@ def free_errors(count: int, what: str) -> Bool[Tensor, "C 7"]:
 
 
 def _gain(
-    frames: KeypointFrame,
-    before: KeypointPoses,
-    moved: KeypointFrame,
-    after: KeypointPoses,
-    delays: Float[Tensor, " C"],
+    frames: KeypointFrame, before: KeypointPoses, after: KeypointPoses, shifts: Float[Tensor, " C"]
 ) -> float:
-    """Return by how much log-evidence grew, of frames in which all cameras have keypoints both times.
+    """Return by how much log-evidence grew for certain, of frames that are far enough from both ends.
 
-    Shifted cameras have other keypoints missing, so evidence is compared per keypoint.
+    Shifted cameras have a few other keypoints there, so evidence is compared per keypoint, and less a margin.
     """
-    count = len(frames.pixels)
-    first, last = int((-delays.min()).ceil().clamp_min(0)), int(delays.max().ceil().clamp_min(0))
-    rows = slice(first, count - last) if first + last < count else slice(0, count)
-    numbers = [(kind.inlier[rows] > 0).sum().clamp_min(1) for kind in (frames, moved)]
+    edge = int(shifts.abs().max())
+    rows = slice(edge, len(frames.pixels) - edge)
+    kinds = frames, shifted(frames, shifts.long())[0]
+    numbers = [(kind.inlier[rows] > 0).sum().clamp_min(1) for kind in kinds]
     evidence = [poses.log_evidence[0, rows].sum() for poses in (before, after)]
-    return float(numbers[0] * (evidence[1] / numbers[1] - evidence[0] / numbers[0]))
+    grown = numbers[0] * (evidence[1] / numbers[1] - evidence[0] / numbers[0])
+    return float(grown) - _MARGIN * edge

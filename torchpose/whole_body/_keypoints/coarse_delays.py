@@ -100,16 +100,18 @@ def _rows(count: int, delay: int) -> tuple[slice, slice]:
     return slice(max(0, -delay), count - max(0, delay)), slice(max(0, delay), count + min(0, delay))
 
 
-def shifted(frames: KeypointFrame, delays: Int[Tensor, " C"]) -> KeypointFrame:
-    """Return frames whose keypoints of camera c are those of frame t + delay; none where there is none.
+def shifted(
+    frames: KeypointFrame, delays: Int[Tensor, " C"], beyond: float = 0.0
+) -> tuple[KeypointFrame, Int[Tensor, "T C"]]:
+    """Return frames with the keypoints of camera c of frame t + delay, and by how much each was shifted.
 
     Args:
         frames: [T, C, J]. delays: whole frames.
+        beyond: factor of the trust in the first and last keypoints, which stand for those before and after.
     """
     count = len(frames.pixels)
-    places = torch.arange(count)[:, None] + delays
-    inside = (places >= 0) & (places < count)
-    places = places.clamp(0, count - 1)
-    cameras = torch.arange(len(delays))
-    moved = KeypointFrame(*(value[places, cameras] for value in frames))
-    return moved._replace(inlier=moved.inlier * inside[..., None])
+    rows = torch.arange(count)[:, None]
+    places = (rows + delays).clamp(0, count - 1)
+    moved = KeypointFrame(*(value[places, torch.arange(len(delays))] for value in frames))
+    trust = torch.where(places == rows + delays, 1.0, beyond).to(moved.inlier)
+    return moved._replace(inlier=moved.inlier * trust[..., None]), places - rows
