@@ -47,6 +47,7 @@ DELAY = N_ERRORS - 1
 _LONGEST, _LEAST_LONGEST = 0.3, 10  # seconds, and frames at least, of a delay that is looked for
 _DELAY_STD = 0.2  # seconds
 _BLOCK = 1.0  # seconds within which errors of a joint's keypoints go together
+_FRAMES = 2000  # at most, that are adjusted to
 _ROUNDS = 5  # of tracking and adjusting, at most
 _BEYOND = (
     0.5  # factor of the trust in keypoints that stand for those before the first or after the last
@@ -106,7 +107,8 @@ def refine_cameras(
             known = poses if i > 0 else None
             moved = _in_time(rig, frames, errors.values, known)
             poses = track(_corrected(rig, errors.values), moved, True)
-        given = given_for(frames, poses.joints[0], errors.values[:, DELAY], free, fps, exchange)
+        delays, stride = errors.values[:, DELAY], max(1, len(frames.pixels) // _FRAMES)
+        given = given_for(frames, poses.joints[0], delays, free, fps, exchange, stride)
         adjusted = adjust(rig, given, errors, _WIDTHS)
         change = (adjusted.errors.values - errors.values).abs()
         errors = adjusted.errors
