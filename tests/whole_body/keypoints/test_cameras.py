@@ -172,6 +172,17 @@ def test_a_refined_track_is_saved_and_read(in_step, tmp_path):
     )
 
 
+def test_a_single_frame_and_a_blind_camera_leave_cameras_as_given(right):
+    tracker = BodyTracker(right.rig, "kalman", fps=FPS)
+    one = tracker(keypoints=right.keypoints[:1], refine="both")
+    assert any("cameras as given" in note for note in one.notes)
+    blind = right.keypoints[:6].clone()
+    blind[:, 2] = torch.nan
+    found = tracker(keypoints=blind, refine="both")
+    assert not found.details["camera_delays"][:, 2].any()
+    assert float(found.details["camera_errors_std"][0, 2, DELAY]) == pytest.approx(0.2 * FPS)
+
+
 def test_what_cannot_be_refined_is_refused(right):
     one = BodyTracker(right.rig.select([0]), "kalman", fps=FPS)
     with pytest.raises(InputError, match="needs two or more, got one"):

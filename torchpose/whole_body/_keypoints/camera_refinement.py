@@ -53,6 +53,7 @@ _BEYOND = (
     0.5  # factor of the trust in keypoints that stand for those before the first or after the last
 )
 _MARGIN = 20.0  # log-evidence of other keypoints in a frame
+_LEAST_GAIN = 3.0  # log-evidence from which corrected cameras are kept
 _SETTLED = 0.2  # standard deviations by which no error changes any more
 _WIDTHS = (50.0, 25.0, 12.0, 6.0, 3.0, 1.5, *[1.0] * 6)
 
@@ -118,7 +119,7 @@ def refine_cameras(
     better = _corrected(rig, errors.values)
     after = track(better, _in_time(rig, frames, errors.values, poses), smoothing)
     gain = _gain(frames, before, after, errors.values[:, DELAY].round()) - adjusted.price
-    if gain > 0:
+    if gain > _LEAST_GAIN:
         moved = _in_time(rig, frames, errors.values, poses)
         return RefinedCameras(errors, better, moved, after, gain, kept=False)
     before = before if smoothing else track(rig, frames, False)
