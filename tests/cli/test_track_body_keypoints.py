@@ -228,6 +228,33 @@ def test_delays_bring_cameras_in_step(track, scene, tmp_path):
         assert (done.code, "from 0 to below the number of frames" in done.err) == (2, True)
 
 
+def test_cameras_are_refined_and_written(track, torchpose, scene, tmp_path):
+    folder = scene[0]
+    given = ("front_json", "left.csv", "behind.npz")
+    cameras = list(load_cameras(folder / "cameras.toml").values())
+    cameras[1].rotation += torch.tensor([0.0, 0.0, 0.08])
+    save_cameras(cameras, tmp_path / "turned.toml")
+    videos = [folder / f"{name}.mp4" for name in PLACES]
+    done = torchpose(
+        "track-body", tmp_path / "turned.toml", *(folder / one for one in given),
+        "--refine", "extrinsics", "--videos", *videos, "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert "refined: camera left was turned by" in done.out and " ± " in done.out
+    refined = CameraRig.load(tmp_path / "out" / "refined_cameras.toml")
+    turned = CameraRig(cameras)
+    assert refined.names == turned.names
+
+    def off(rig):
+        poses = BodyTrack.load(tmp_path / "out" / "body.npz")
+        return float((rig(poses.joints3d).pixels - scene[2])[:, 1].norm(dim=-1).median())
+
+    assert off(refined) < 0.5 * off(turned)
+    assert (tmp_path / "out" / "overlay_left.mp4").exists()
+    assert track(tmp_path / "out", *given, *PLAIN).code == 0
+    assert not (tmp_path / "out" / "refined_cameras.toml").exists()  # of an earlier run
+
+
 def test_an_unknown_rate_is_said(track, tmp_path):
     done = track(tmp_path, "front_json", "--camera-names", "[front]", "--height", 1.75, *PLAIN)
     assert (done.code, "no input states a frame rate: 30 fps assumed" in done.out) == (0, True)
@@ -253,6 +280,9 @@ def test_an_unknown_rate_is_said(track, tmp_path):
         ),
         ((*MIXED, "--motion", "gone"), "gone"),
         ((*MIXED, "--smoothing", "5"), "--smoothing must be one of none, full"),
+        ((*MIXED, "--refine", "all"), "--refine must be one of none, delays"),
+        (("front.npz", "--camera-names", "[front]", "--refine", "both"), "needs two or more"),
+        (("front.mp4", "left.mp4", "behind.mp4", "--refine", "both"), "--refine is for keypoints"),
         ((*MIXED, "--keypoint-std", -1), "--keypoint-std must be positive"),
         (("front.mp4", "left.csv", "behind.npz"), "--detector finds the keypoints in videos"),
         (("gone", "left.csv", "behind.npz"), "and is not there"),

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --fps 60 --smoothing full --out result
 torchpose track-body cameras.toml cam1.npz cam2.csv --videos cam1.mp4 cam2.mp4 --out result
+torchpose track-body cameras.toml cam1_json/ cam2_json/ --refine both --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 --detector rtmpose-m.onnx --out result
 torchpose track-body cameras.toml cam*.npz --formats trc c3d bvh --up z --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -52,7 +53,9 @@ _OF_SILHOUETTES = (
     "background", "ignore_still", "initial_pose", "facing", "rows", "sharpness", "manifold",
     "conditionals", "action", "n_particles",
 )  # fmt: skip
-_OF_KEYPOINTS = ("smoothing", "videos", "keypoint_std", "pixel_std", "motion", "min_confidence")
+_OF_KEYPOINTS = (
+    "smoothing", "refine", "videos", "keypoint_std", "pixel_std", "motion", "min_confidence",
+)  # fmt: skip
 _BY_KEYPOINTS = "kalman"
 
 
@@ -83,6 +86,7 @@ def command() -> Command:
             "detector": "FILE|package:factory",
             "formats": "trc|c3d|bvh",
             "smoothing": "none|full",
+            "refine": "none|delays|extrinsics|both",
         },
     )
 
@@ -107,6 +111,7 @@ def run(
     detector: str | None = None,
     min_confidence: float | None = None,
     smoothing: Literal["none", "full"] = "none",
+    refine: Literal["none", "delays", "extrinsics", "both"] = "none",
     videos: list[str] | None = None,
     background: list[str] | None = None,
     ignore_still: bool = False,
@@ -142,6 +147,8 @@ def run(
             (.task), or package:factory, a Python callable that returns a detector.
         min_confidence: with --detector: of a keypoint, below which it counts as missing (default 0.3).
         smoothing: keypoints: "full" lets later frames count too.
+        refine: keypoints: estimate the cameras' delays against the first, their poses (extrinsics), or both
+            from the person who moves, and write refined_cameras.toml.
         videos: keypoints: a video per camera, into which the body is drawn; by default the inputs, if they
             are videos.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
@@ -235,8 +242,9 @@ def _run_on_keypoints(
     names = ("body", "height", "keypoint_std", "pixel_std", "motion")
     arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
     settings = KeypointSettings(
-        detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments
-    )
+        detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments,
+        values["refine"],
+    )  # fmt: skip
     return track_keypoints(job, inputs, cameras, settings)
 
 

@@ -1,5 +1,6 @@
 """`torchpose track-body` on keypoints: of files, or of a detector in videos."""
 
+import copy
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["KeypointSettings", "track_keypoints"]
 
+_CAMERAS = "refined_cameras.toml"
 _SAME_RATE = 0.01  # relative: of videos that are not resampled
 
 
@@ -48,7 +50,7 @@ class KeypointSettings(NamedTuple):
         detector: of keypoints in videos, or None. smoothing: "none" or "full".
         videos: into which the body is drawn, for each camera; None for the inputs, if they are videos.
         fps: of all inputs, None if they tell. delays: frames by which each began too early.
-        tracker: the arguments of `BodyTracker`.
+        tracker: the arguments of `BodyTracker`. refine: what of the cameras is estimated.
     """
 
     detector: DetectorSettings | None
@@ -57,6 +59,7 @@ class KeypointSettings(NamedTuple):
     fps: float | None
     delays: list[int] | None
     tracker: dict[str, Any]
+    refine: str = "none"
 
 
 def track_keypoints(
@@ -81,7 +84,7 @@ def track_keypoints(
         if shown is not None and (overlay or job.pictures):
             films = stack.enter_context(Films(shown, cameras, settings.delays))
         results = stack.enter_context(
-            body_results(job, cameras, overlay, _pictures(job, films is not None))
+            body_results(job, cameras, overlay, _more(job, films is not None, settings))
         )
         keypoints = read_body_keypoints(
             inputs, cameras, detector=settings.detector, fps=settings.fps, delays=settings.delays,
@@ -93,8 +96,9 @@ def track_keypoints(
         if poses is None:
             print("torchpose: no camera has a keypoint, so there are no poses", file=sys.stderr)
             return 1
-        written = results.commit(write_poses(job, results.stage, poses))
         stage, drawn = results.stage, []
+        keypoints, cameras_file = _refined(keypoints, settings, poses, stage)
+        written = results.commit([*write_poses(job, stage, poses), *cameras_file])
         if films is not None:
             drawn = draw(films.showing(keypoints), poses, stage, overlay, job.pictures)
         if job.pictures:
@@ -104,8 +108,28 @@ def track_keypoints(
     return summary(poses, facts, written, results.notes)
 
 
-def _pictures(job: BodyJob, films: bool) -> list[str]:
-    return [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
+def _more(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
+    """Return the names of further files: pictures, cameras."""
+    pictures = [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
+    return pictures + [_CAMERAS] * (settings.refine != "none")
+
+
+def _refined(
+    keypoints: BodyKeypoints, settings: KeypointSettings, poses: "BodyTrack", stage: "Path"
+) -> tuple[BodyKeypoints, "list[Path]"]:
+    """Return keypoints with the refined cameras, and the file of these; both as given without --refine."""
+    if settings.refine == "none":
+        return keypoints, []
+    from torchpose.camera._pinhole import save_cameras
+
+    rotations = poses.details["camera_rotation"][0]
+    translations = poses.details["camera_translation"][0]
+    cameras = [copy.deepcopy(camera) for camera in keypoints.cameras]
+    for camera, rotation, translation in zip(cameras, rotations, translations, strict=True):
+        camera.rotation.copy_(rotation)
+        camera.translation.copy_(translation)
+    save_cameras(cameras, stage / _CAMERAS)
+    return keypoints._replace(cameras=cameras), [stage / _CAMERAS]
 
 
 def _tracker(
@@ -123,7 +147,7 @@ def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "BodyTrack |
     try:
         poses = tracker(
             keypoints=keypoints.points, confidence=keypoints.confidence,
-            smoothing=settings.smoothing, progress=show_progress(),
+            smoothing=settings.smoothing, refine=settings.refine, progress=show_progress(),
         )  # fmt: skip
     except NobodySeenError:
         return None
@@ -218,6 +242,8 @@ class Films:
     def showing(self, keypoints: BodyKeypoints) -> "Films":
         """Return the same with keypoints to be drawn, at whose frame rate the videos are read."""
         self.fps, self._keypoints = keypoints.fps, keypoints
+        for shown, camera in zip(self._cameras, keypoints.cameras, strict=True):
+            shown.rotation, shown.translation = camera.rotation, camera.translation
         return self
 
     def images(self) -> Iterator[tuple[Any, ...]]:
@@ -231,13 +257,16 @@ class Films:
 
     def drawn(self, poses: "BodyTrack", t: int, images: Sequence[Any]) -> list[Any]:
         """Return the images of frame t of all cameras with the body and its keypoints."""
+        import torch
+
         from torchpose.video._overlay import draw_body
 
-        joints = poses.joints3d[t - poses.first_frame]
+        delays = poses.details.get("camera_delays", torch.zeros(1, len(images)))[0].round().long()
+        at = (t - poses.first_frame - delays).clamp(0, len(poses) - 1)
         return [
             draw_body(
                 image,
-                project_joints(joints, camera),
+                project_joints(poses.joints3d[at[c]], camera),
                 poses.body.skeleton,
                 keypoints=self._seen(t, c),
             )

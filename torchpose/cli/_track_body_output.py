@@ -32,7 +32,10 @@ __all__ = [
 ]
 
 _POSES = ("body.npz", "joints.csv")
-_OWN = r"body\.(npz|trc|c3d|bvh)|joints\.csv|overlay(_.+\.mp4|\.png)|skeleton\.png|report\.html"
+_OWN = (
+    r"body\.(npz|trc|c3d|bvh)|joints\.csv|overlay(_.+\.mp4|\.png)|skeleton\.png|report\.html"
+    r"|refined_cameras\.toml"
+)
 _MOST_RUNS = 8  # of actions that are listed by their frames
 
 

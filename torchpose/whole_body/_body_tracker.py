@@ -259,6 +259,7 @@ class BodyTracker(nn.Module):
         names: Sequence[str] | None = None,
         covariance: Float[Tensor, "*B T C J"] | None = None,
         smoothing: str = "none",
+        refine: str = "none",
         generator: torch.Generator | None = None,
         lengths: Int[Tensor, "1"] | None = None,
         facing: Float[Tensor, "3"] | None = None,
@@ -269,11 +270,15 @@ class BodyTracker(nn.Module):
 
         Args:
             keypoints: [T, C, J, 2] or [B, T, C, J, 2], pixels as detected, NaN where there is none; for
-                "kalman", which takes these five arguments and `progress`.
+                "kalman", which takes these six arguments and `progress`.
             confidence: [..., C, J], from 0 (no keypoint) to 1; all 1 by default.
             names: of the J joints, of any known set; those of `BODY_15` by default.
             covariance: [..., C, J], variance along u and v, pixels squared, in place of the usual noise.
             smoothing: "full" lets later frames count too; "none" filters.
+            refine: "delays", "extrinsics" or "both" of the cameras are estimated first; of one recording in
+                two cameras or more. `details` then hold `camera_delays` [T, C], the frames by which cameras
+                began too early, `camera_rotation` (Rodrigues) and `camera_translation` [T, C, 3], and
+                `camera_errors_std` [T, C, 7] of rotation (radians), shift (metres) and delay (frames).
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
@@ -297,7 +302,7 @@ class BodyTracker(nn.Module):
                 raise InputError(f"method {self.method} takes keypoints, got none")
             return self.by_keypoints(
                 keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
-                progress=progress,
+                refine=refine, progress=progress,
             )  # fmt: skip
         if keypoints is not None or silhouettes is None:
             raise InputError(

@@ -1,6 +1,7 @@
 """Track one person or several recordings through keypoints of calibrated cameras, to `BodyTrack`."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,6 +16,17 @@ from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeErro
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.camera_notes import (
+    doubt_cameras,
+    notes_on_cameras,
+    notes_on_refined,
+)
+from torchpose.whole_body._keypoints.camera_refinement import (
+    REFINED,
+    RefinedCameras,
+    details_of_cameras,
+    refine_cameras,
+)
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import notes_of
 from torchpose.whole_body._keypoints.keypoint_tracker import (
@@ -98,10 +110,12 @@ class KeypointBodyTracker(nn.Module):
         *,
         covariance: Float[Tensor, "*B T C J"] | None = None,
         smoothing: str = "none",
+        refine: str = "none",
         progress: bool = False,
     ) -> BodyTrack | list[BodyTrack]:
         """Track whole sequences; see `BodyTracker.forward`."""
         check_choice("smoothing", smoothing, SMOOTHING)
+        self._check_refine(refine, keypoints)
         check_shape("keypoints", keypoints, ["...", "T", len(self.rig), None, 2])
         if keypoints.ndim not in (4, 5):
             raise ShapeError(
@@ -112,6 +126,8 @@ class KeypointBodyTracker(nn.Module):
         if single:
             frames = KeypointFrame(*(value[None] for value in frames))
         self._check_seen(frames)
+        if refine != "none":
+            return self._refined_track(frames, refine, smoothing == "full", progress)
         poses = self.tracker(frames, smoothing == "full", progress)
         tracks = [self._track(poses, frames, b) for b in range(len(frames.pixels))]
         return tracks[0] if single else tracks
@@ -134,6 +150,43 @@ class KeypointBodyTracker(nn.Module):
         poses = _with_time(pose)
         frames = KeypointFrame(*(value[:, None] for value in frame))
         return stream, self._track(poses, frames, 0, summed_up=False)
+
+    # --- cameras ----------------------------------------------------------------------------------
+
+    def _check_refine(self, refine: str, keypoints: Tensor) -> None:
+        """Refuse to refine what one camera or several recordings do not tell."""
+        check_choice("refine", refine, REFINED)
+        if refine == "none":
+            return
+        if len(self.rig) == 1:
+            raise InputError(
+                f"refine={refine!r} compares cameras and needs two or more, got one; leave it out"
+            )
+        if keypoints.ndim != 4:
+            raise ShapeError(
+                "refine is for one recording, keypoints of shape [T, C, J, 2], got "
+                f"{list(keypoints.shape)}; track recordings one after the other"
+            )
+
+    def _refined_track(
+        self, frames: KeypointFrame, refine: str, smoothing: bool, progress: bool
+    ) -> BodyTrack:
+        """Return the track with cameras without the errors that keypoints tell of."""
+        former = self.tracker.filter
+
+        def track(rig: CameraRig, moved: KeypointFrame, smooth: bool) -> KeypointPoses:
+            tracker = KeypointTracker(rig, self.fps, former.motion, upright=former.upright)
+            return tracker(KeypointFrame(*(value[None] for value in moved)), smooth, progress)
+
+        single = KeypointFrame(*(value[0] for value in frames))
+        found = refine_cameras(
+            self.rig, single, track, self.fps, refine, former.exchange, smoothing
+        )
+        moved = KeypointFrame(*(value[None] for value in found.frames))
+        result = self._track(found.poses, moved, 0, refined=found)
+        notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes)
+        details = details_of_cameras(found, len(result))
+        return replace(result, notes=notes, details={**result.details, **details})
 
     # --- keypoints --------------------------------------------------------------------------------
 
@@ -200,7 +253,12 @@ class KeypointBodyTracker(nn.Module):
     # --- poses ------------------------------------------------------------------------------------
 
     def _track(
-        self, poses: KeypointPoses, frames: KeypointFrame, b: int, summed_up: bool = True
+        self,
+        poses: KeypointPoses,
+        frames: KeypointFrame,
+        b: int,
+        summed_up: bool = True,
+        refined: RefinedCameras | None = None,
     ) -> BodyTrack:
         """Return the track of one element of the batch."""
         body = self.tracker.filter.articulation
@@ -221,7 +279,7 @@ class KeypointBodyTracker(nn.Module):
             poses.coasting[b],
             poses.started[b] & (poses.started[b].cumsum(0) > 1),
             self.fps,
-            notes=self._notes(poses, frame, b) if summed_up else (),
+            notes=self._notes(poses, frame, b, refined) if summed_up else (),
             details={
                 "inlier": poses.inlier[b],
                 "exchanged": poses.exchanged[b],
@@ -238,11 +296,19 @@ class KeypointBodyTracker(nn.Module):
         turns[:, body.axis_part, body.axis] = std[:, body.columns["rotations"]] / 2
         return torch.cat([std[:, body.columns["position"]], turns.flatten(1)], -1)
 
-    def _notes(self, poses: KeypointPoses, frame: KeypointFrame, b: int) -> tuple[str, ...]:
-        return notes_of(
+    def _notes(
+        self, poses: KeypointPoses, frame: KeypointFrame, b: int, refined: RefinedCameras | None
+    ) -> tuple[str, ...]:
+        notes = notes_of(
             self.rig.names, frame.inlier > 0, poses.inlier[b], poses.exchanged[b],
             poses.coasting[b], self.sized,
         )  # fmt: skip
+        if len(self.rig) == 1:
+            return notes
+        rig = self.rig if refined is None else refined.rig
+        exchange = self.tracker.filter.exchange
+        doubts = doubt_cameras(rig, frame, poses.joints[b], self.fps, exchange)
+        return (*notes, *notes_on_cameras(self.rig.names, doubts))
 
 
 def _rigid_body(bones: Float[Tensor, "T J 3"]) -> Body:

@@ -1,0 +1,194 @@
+"""Delays and poses of cameras from the keypoints of a person: found, left alone, said, and refused."""
+
+import math
+
+import pytest
+import torch
+
+from tests.whole_body.keypoints.scenes import FPS, Scene, errors, moving_body, ring
+from torchpose.camera import CameraRig
+from torchpose.errors import InputError, ShapeError
+from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
+from torchpose.whole_body import BodyTrack, BodyTracker
+from torchpose.whole_body._keypoints.camera_bundle import CameraErrors, by_pose, corrected_pose
+from torchpose.whole_body._keypoints.camera_refinement import DELAY, _corrected
+from torchpose.whole_body._keypoints.coarse_delays import coarse_delays, shifted
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+
+T = 40
+TURN = (0.6, -0.7, 0.4)  # direction of a rotation, and of a shift
+SHIFT = (-0.5, 0.5, 0.7)
+
+
+def filmed(delays=(0.0, 0.0, 0.0), noise: float = 3.0, seed: int = 0) -> Scene:
+    """A person in cameras that began too early by so many frames."""
+    generator = torch.Generator().manual_seed(seed)
+    rig = ring(len(delays))
+    seen = [moving_body(T, phase=-delay / FPS) for delay in delays]
+    pixels = torch.stack([rig(j).pixels[:, c] for c, j in enumerate(seen)], 1)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    return Scene(seen[0], rig, pixels, torch.full_like(pixels[..., 0], 0.9))
+
+
+def disturbed(rig: CameraRig, camera: int, degrees: float, metres: float) -> CameraRig:
+    values = CameraErrors.none(rig).values
+    unit = [torch.tensor(v, dtype=torch.float64) / math.hypot(*v) for v in (TURN, SHIFT)]
+    values[camera, :3], values[camera, 3:DELAY] = math.radians(degrees) * unit[0], metres * unit[1]
+    return _corrected(rig, values)
+
+
+def track(given: Scene, rig=None, **options):
+    tracker = BodyTracker(given.rig if rig is None else rig, "kalman", fps=FPS)
+    return tracker(
+        keypoints=given.keypoints, confidence=given.confidence, smoothing="full", **options
+    )
+
+
+def mean_error(found, given: Scene) -> float:
+    return float(errors(found, given.joints)[8:-8].mean())
+
+
+@pytest.fixture(scope="module")
+def late():
+    """Cameras that began 3 and 1.5 frames too early."""
+    return filmed((0.0, 3.0, 1.5))
+
+
+@pytest.fixture(scope="module")
+def right():
+    return filmed()
+
+
+@pytest.fixture(scope="module")
+def tracked(right):
+    return track(right)
+
+
+@pytest.fixture(scope="module")
+def in_step(late):
+    return track(late, refine="delays")
+
+
+# --- delays -----------------------------------------------------------------------------------------
+
+
+def test_delays_are_found(late, in_step):
+    found = in_step
+    delays, std = found.details["camera_delays"], found.details["camera_errors_std"][..., DELAY]
+    assert delays.shape == (T, 3)
+    torch.testing.assert_close(
+        delays[0], torch.tensor([0.0, 3.0, 1.5], dtype=torch.float64), atol=0.2, rtol=0
+    )
+    assert (std[0, 1:] > 0).all() and (std[0, 1:] < 0.3).all()
+    assert mean_error(found, late) < 0.01
+    assert any("c1 began 3.0" in note and "earlier than c0" in note for note in found.notes)
+
+
+def test_whole_frames_are_found_from_pairs_of_cameras():
+    given = filmed((0.0, 5.0, -4.0), noise=1.0)
+    ones = given.confidence
+    frames = KeypointFrame(given.keypoints, ones, 0 * ones, ones)
+    assert coarse_delays(given.rig, frames, 8).tolist() == [0, 5, -4]
+    moved, by = shifted(frames, torch.tensor([0, 5, -4]))
+    assert by[10].tolist() == [0, 5, -4] and by[-1].tolist() == [0, 0, -4]
+    torch.testing.assert_close(moved.pixels[10, 1], given.keypoints[15, 1])
+    assert not moved.inlier[-5:, 1].any() and moved.inlier[:-5, 1].all()
+    assert not moved.inlier[:4, 2].any()
+
+
+# --- poses ------------------------------------------------------------------------------------------
+
+
+def test_a_turned_and_shifted_camera_is_corrected(right, tracked):
+    rig = disturbed(right.rig, 1, 1.0, 0.03)
+    wrong, best = track(right, rig), tracked
+    found = track(right, rig, refine="extrinsics")
+    assert mean_error(found, right) < 0.6 * mean_error(wrong, right)
+    apart = [_apart_of_one_motion(x.joints3d, right.joints) for x in (found, best, wrong)]
+    assert apart[0] < apart[1] + 0.0003 < apart[2]
+    turned = rotvec_to_matrix(found.details["camera_rotation"][0]) @ right.rig.rotation.mT
+    angle = torch.rad2deg(torch.arccos(((turned[1].trace() - 1) / 2).clamp(-1, 1)))
+    assert float(angle) < 0.6
+
+
+def _apart_of_one_motion(joints, truth) -> float:
+    """Mean distance after one rigid motion of the whole recording, by orthogonal Procrustes."""
+    a, b = joints.reshape(-1, 3), truth.reshape(-1, 3)
+    middle = a.mean(0), b.mean(0)
+    u, _, vt = torch.linalg.svd((a - middle[0]).T @ (b - middle[1]))
+    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))], dtype=a.dtype))
+    return float(((a - middle[0]) @ (u @ flip @ vt) + middle[1] - b).norm(dim=-1).mean())
+
+
+def test_derivatives_by_poses_are_those_of_differences(right):
+    joints, rig = right.joints[:2], right.rig
+    derivative = by_pose(rig, joints)
+    for k in range(DELAY):
+        values = CameraErrors.none(rig).values
+        values[:, k] = 1e-6
+        step = _corrected(rig, values)(joints).pixels - rig(joints).pixels
+        torch.testing.assert_close(derivative[..., k], step / 1e-6, atol=1e-2, rtol=1e-4)
+
+
+def test_a_rotation_leaves_a_camera_in_its_place(right):
+    values = CameraErrors.none(right.rig).values
+    values[:, :3] = torch.tensor(TURN, dtype=torch.float64)
+    rotation, translation = corrected_pose(right.rig, values)
+    places = [-(R.mT @ t[..., None]) for R, t in ((rotation, translation),
+                                                  (right.rig.rotation, right.rig.translation))]  # fmt: skip
+    torch.testing.assert_close(*places)
+    small = torch.eye(3, dtype=torch.float64) + 1e-6 * cross_matrix(values[0, :3])
+    torch.testing.assert_close(rotvec_to_matrix(1e-6 * values[0, :3]), small)
+
+
+# --- what is right, and what nobody asked for ---------------------------------------------------------
+
+
+def test_right_cameras_stay_and_nothing_is_said(right, tracked):
+    found = track(right, refine="both")
+    assert not found.details["camera_delays"].any()
+    torch.testing.assert_close(
+        found.details["camera_translation"][0], right.rig.translation, atol=1e-12, rtol=0
+    )
+    torch.testing.assert_close(found.joints3d, tracked.joints3d)
+    assert any("cameras as given" in note for note in found.notes)
+    assert not any("seems" in note or "degrees" in note for note in found.notes)
+    assert not tracked.notes
+
+
+def test_notes_say_what_was_not_asked_for(right):
+    late = track(filmed((0.0, 0.0, 2.0))).notes
+    assert len(late) == 1 and "camera c2 seems to have begun" in late[0]
+    assert "earlier than c0" in late[0] and "--refine delays" in late[0]
+    turned = track(right, disturbed(right.rig, 1, 1.5, 0.02)).notes
+    assert len(turned) == 1 and "degrees away" in turned[0] and "--refine extrinsics" in turned[0]
+
+
+def test_a_refined_track_is_saved_and_read(in_step, tmp_path):
+    in_step.save(tmp_path / "body.npz")
+    again = BodyTrack.load(tmp_path / "body.npz")
+    torch.testing.assert_close(
+        again.details["camera_delays"].double(), in_step.details["camera_delays"]
+    )
+
+
+def test_a_single_frame_and_a_blind_camera_leave_cameras_as_given(right):
+    tracker = BodyTracker(right.rig, "kalman", fps=FPS)
+    one = tracker(keypoints=right.keypoints[:1], refine="both")
+    assert any("cameras as given" in note for note in one.notes)
+    blind = right.keypoints[:6].clone()
+    blind[:, 2] = torch.nan
+    found = tracker(keypoints=blind, refine="both")
+    assert not found.details["camera_delays"][:, 2].any()
+    assert float(found.details["camera_errors_std"][0, 2, DELAY]) == pytest.approx(0.2 * FPS)
+
+
+def test_what_cannot_be_refined_is_refused(right):
+    one = BodyTracker(right.rig.select([0]), "kalman", fps=FPS)
+    with pytest.raises(InputError, match="needs two or more, got one"):
+        one(keypoints=right.keypoints[:, :1], refine="both")
+    several = BodyTracker(right.rig, "kalman", fps=FPS)
+    with pytest.raises(ShapeError, match="one recording"):
+        several(keypoints=right.keypoints[None], refine="both")
+    with pytest.raises(InputError, match="refine"):
+        several(keypoints=right.keypoints, refine="all")

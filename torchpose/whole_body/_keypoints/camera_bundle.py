@@ -1,0 +1,242 @@
+"""Adjust cameras and delays to the keypoints of a moving body, with its joints eliminated.
+
+The keypoint of joint j in frame t of camera c is u = h(exp(w_c) (R_c p + t_c) + s_c) with p the joint at
+t - d_c, p_j(t) - d_c v_j(t). Unknown are the joints p_j(t), and of every camera its errors
+e_c = (w_c, s_c, d_c): a small rotation, a shift in the camera's axes and a delay. One step of Gauss and
+Newton solves the normal equations of the errors alone,
+
+    S = sum B^T R^-1 B + L - sum_tj E^T W^-1 E,   W = sum_c A^T R^-1 A,   E = A^T R^-1 B,
+
+with A and B the derivatives of pixels by joints and by errors, noise R over the probability that a keypoint
+is its joint's, and L the information of a prior that cameras are about right. It decides what pixels do not
+tell: where all cameras are in the room together, and how large it is.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.camera._rig import CameraRig
+from torchpose.math._gaussian import safe_cholesky
+from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    Beliefs,
+    Exchange,
+    KeypointFrame,
+    RigMaps,
+    Seen,
+    squared_errors,
+    weigh,
+)
+
+__all__ = [
+    "N_ERRORS",
+    "ROTATION_STD",
+    "SHIFT_STD",
+    "Adjusted",
+    "BundleInputs",
+    "CameraErrors",
+    "adjust",
+    "by_pose",
+    "corrected_pose",
+]
+
+N_ERRORS = 7  # of a camera: rotation, shift, delay
+ROTATION_STD, SHIFT_STD = 0.0175, 0.03  # radians, metres
+_LEAST_DEPTH = 0.05  # metres
+_EXCHANGED = -3.5  # prior log-odds of exchanged sides
+_JOINT_STD = 5.0  # metres, of joints about where tracking has them; tells where no two cameras do
+_SCALES = (0.3, 20.0)  # factors of a camera's noise
+
+
+class CameraErrors(NamedTuple):
+    """Holds the errors of C cameras.
+
+    Attributes:
+        values: [C, 7], rotation (radians) and shift (metres) in camera axes, and delay (frames).
+        cov: [7 C, 7 C], their covariance; 0 for those that were not estimated.
+    """
+
+    values: Tensor
+    cov: Tensor
+
+    @classmethod
+    def none(cls, rig: CameraRig) -> Self:
+        """Return no errors."""
+        n = N_ERRORS * len(rig)
+        return cls(rig.matrix.new_zeros(len(rig), N_ERRORS), rig.matrix.new_zeros(n, n))
+
+    @property
+    def std(self) -> Float[Tensor, "C 7"]:
+        """Return standard deviations."""
+        return self.cov.diagonal().clamp_min(0).sqrt().view_as(self.values)
+
+
+class BundleInputs(NamedTuple):
+    """Holds what cameras are adjusted to.
+
+    Attributes:
+        frames: keypoints [T, C, J]. joints, velocity: [T, J, 3], metres, and metres a frame.
+        shifts: [C], frames by which keypoints were shifted already, which the delays include.
+        free: [C, 7], which errors are estimated. delay_std: frames, of delays before they are estimated.
+        block: frames within which errors of a joint's keypoints go together. exchange: of sides.
+    """
+
+    frames: KeypointFrame
+    joints: Tensor
+    velocity: Tensor
+    shifts: Tensor
+    free: Tensor
+    delay_std: float
+    block: int
+    exchange: Exchange
+
+
+class Adjusted(NamedTuple):
+    """Holds what an adjustment gives.
+
+    Attributes:
+        errors: of the cameras. price: what free errors cost in log-evidence, by Laplace's approximation:
+            e^T L e / 2 + log det(S L^-1) / 2.
+    """
+
+    errors: CameraErrors
+    price: float
+
+
+class _Equations(NamedTuple):
+    """Holds factors of W [T, J, 3, 3], E [T, J, 3, 7 C], b [T, J, 3], S [7 C, 7 C] and g [T, J, 7 C]."""
+
+    chol: Tensor
+    E: Tensor
+    b: Tensor
+    S: Tensor
+    g: Tensor
+
+
+def corrected_pose(
+    rig: CameraRig, values: Float[Tensor, "C 7"]
+) -> tuple[Float[Tensor, "C 3 3"], Float[Tensor, "C 3"]]:
+    """Return rotations and translations of cameras without their errors."""
+    turn = rotvec_to_matrix(values[:, :3])
+    return turn @ rig.rotation, (turn @ rig.translation[..., None]).squeeze(-1) + values[:, 3:6]
+
+
+def adjust(
+    rig: CameraRig, given: BundleInputs, start: CameraErrors, widths: Sequence[float]
+) -> Adjusted:
+    """Return the errors of cameras after a step of Gauss and Newton for every width of the noise.
+
+    Args:
+        rig: the cameras as they were given. given: keypoints and joints. start: errors to begin with.
+        widths: factors of the noise's variance, falling to 1.
+    """
+    values, joints = start.values, given.joints
+    scale = values.new_ones(len(rig))
+    prior, free = _information(given), given.free.flatten()
+    joint_cov: Tensor | None = None
+    for width in widths:
+        equations, scale = _equations(rig, given, values, joints, joint_cov, scale, width, prior)
+        chol, E, b, S, g = equations
+        L = safe_cholesky(S[free][:, free])
+        pull = g.sum((0, 1)) - prior * values.flatten()
+        step = torch.zeros_like(pull)
+        step[free] = torch.cholesky_solve(pull[free, None], L).squeeze(-1)
+        moved = torch.cholesky_solve(b[..., None] - (E @ step)[..., None], chol).squeeze(-1)
+        values, joints = values + step.view_as(values), joints + moved
+        joint_cov = torch.cholesky_inverse(chol)
+    cov = torch.zeros_like(start.cov)
+    rows = free.nonzero().squeeze(-1)
+    cov[rows[:, None], rows] = _covariance(given, g[..., free], prior[free], L)
+    spent = (prior * values.flatten().square())[free].sum() / 2
+    narrowed = L.diagonal().log().sum() - prior[free].log().sum() / 2
+    return Adjusted(CameraErrors(values, cov), float(spent + narrowed))
+
+
+def _information(given: BundleInputs) -> Float[Tensor, " C7"]:
+    """Return the information of the prior about errors."""
+    std = [ROTATION_STD] * 3 + [SHIFT_STD] * 3 + [given.delay_std]
+    return torch.tensor(std).to(given.joints).square().reciprocal().repeat(len(given.free))
+
+
+def _equations(
+    rig: CameraRig,
+    given: BundleInputs,
+    values: Tensor,
+    joints: Tensor,
+    joint_cov: Tensor | None,
+    scale: Tensor,
+    width: float,
+    prior: Tensor,
+) -> tuple[_Equations, Float[Tensor, " C"]]:
+    """Return the normal equations with joints eliminated, and the next factors of the cameras' noise."""
+    frames = given.frames
+    seen, by_errors = _seen(rig, values, joints, given.velocity, given.shifts)
+    count = len(frames.pixels)
+    maps = RigMaps.of(rig)
+    beliefs = Beliefs(scale.new_full((count, len(rig), 2), _EXCHANGED), scale.expand(count, -1))
+    cov = joints.new_zeros(*joints.shape, 3) if joint_cov is None else joint_cov
+    weighed = weigh(frames, seen, maps, beliefs, given.exchange, cov, decide=width < 2, width=width)
+    sums, number = squared_errors(frames, seen, weighed, cov)
+    ratio = sums.sum(0) / number.sum(0).clamp_min(1e-6) * width
+    scale = (scale * ratio).clamp(*_SCALES) if joint_cov is not None else scale
+    w = (weighed.own / weighed.variance)[..., None, None]
+    A, r = seen.by_joint, (frames.pixels - seen.pixels)[..., None]
+    Aw, Bw = (w * A).mT, (w * by_errors).mT
+    W = (Aw @ A).sum(1) + torch.eye(3).to(A) / _JOINT_STD**2
+    b = (Aw @ r).sum(1).squeeze(-1) + (given.joints - joints) / _JOINT_STD**2
+    E = (Aw @ by_errors).permute(0, 2, 3, 1, 4).flatten(-2)
+    chol = torch.linalg.cholesky(W)
+    X = torch.linalg.solve_triangular(chol, E, upper=False)
+    own = torch.block_diag(*(Bw @ by_errors).sum((0, 2)))
+    S = own + torch.diag(prior) - torch.einsum("tjia,tjib->ab", X, X)
+    g = (Bw @ r).squeeze(-1).transpose(1, 2).flatten(-2)
+    g = g - (E.mT @ torch.cholesky_solve(b[..., None], chol)).squeeze(-1)
+    return _Equations(chol, E, b, S, g), scale
+
+
+def by_pose(rig: CameraRig, joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T C J 2 6"]:
+    """Return the derivative of pixels by rotation and shift of the cameras that see them."""
+    none = CameraErrors.none(rig).values
+    seen = _seen(rig, none, joints, torch.zeros_like(joints), none[:, 0])
+    return seen[1][..., : N_ERRORS - 1]
+
+
+def _seen(
+    rig: CameraRig, values: Tensor, joints: Tensor, velocity: Tensor, shifts: Tensor
+) -> tuple[Seen, Float[Tensor, "T C J 2 7"]]:
+    """Return joints as cameras see them, and the derivative by the cameras' errors."""
+    R, t = corrected_pose(rig, values)
+    late = (values[:, 6] - shifts)[:, None, None]
+    moved = joints[:, None] - late * velocity[:, None]
+    X = moved @ R.mT + t[:, None]
+    depth = X[..., 2]
+    in_front = depth > _LEAST_DEPTH
+    depth = torch.where(in_front, depth, 1.0)[..., None]
+    homogeneous = X @ rig.matrix.mT
+    pixels = homogeneous[..., :2] / depth
+    K = rig.matrix[:, None]
+    by_point = (K[..., :2, :] - pixels[..., None] * K[..., 2:, :]) / depth[..., None]
+    by_joint = by_point @ R[:, None]
+    turned = X - values[:, None, 3:6]
+    by_turn = -by_point @ cross_matrix(turned)
+    by_delay = -by_joint @ velocity[:, None, ..., None]
+    return Seen(pixels, by_joint, in_front), torch.cat([by_turn, by_point, by_delay], -1)
+
+
+def _covariance(
+    given: BundleInputs,
+    g: Float[Tensor, "T J N"],
+    prior: Float[Tensor, " N"],
+    L: Float[Tensor, "N N"],
+) -> Float[Tensor, "N N"]:
+    """Return the covariance of errors, S^-1 (sum_b g_b g_b^T + L) S^-1, b joints over a second.
+
+    Keypoints of a joint err alike from frame to frame, which S^-1 would not know.
+    """
+    groups = torch.stack([part.sum(0) for part in g.split(given.block)]).flatten(0, 1)
+    meat = groups.mT @ groups + torch.diag(prior)
+    return torch.cholesky_solve(torch.cholesky_solve(meat, L).mT, L)

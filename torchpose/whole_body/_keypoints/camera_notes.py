@@ -1,0 +1,146 @@
+"""Say which cameras the keypoints of a tracked body contradict, by what, and what was refined."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.camera._rig import CameraRig
+from torchpose.whole_body._keypoints.camera_bundle import CameraErrors, adjust, by_pose
+from torchpose.whole_body._keypoints.camera_refinement import (
+    DELAY,
+    RefinedCameras,
+    free_errors,
+    given_for,
+)
+from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame
+
+__all__ = ["CameraDoubts", "doubt_cameras", "notes_on_cameras", "notes_on_refined"]
+
+_FRAMES = 150  # at most, of those that are looked at
+_WIDTHS = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)
+_LEAST_DELAY = 0.5  # frames
+_SURE_DELAY = 5.0  # standard deviations
+_LEAST_TURN = 0.4  # degrees by which a camera sees joints elsewhere
+_SURE_TURN = 8.0  # standard deviations; right cameras stay below 2, turned ones have 25 to 90
+_WINDOW = 0.1  # seconds over which tracked joints are averaged before they give velocities
+
+
+class CameraDoubts(NamedTuple):
+    """Holds by what each of C cameras seems to be wrong.
+
+    Attributes:
+        delays, delay_std: [C], frames against the first camera. turns: [C], degrees by which the camera sees
+            joints elsewhere than the other cameras have them, root mean square, if they are right.
+        turn_sigmas: [C], that in standard deviations.
+    """
+
+    delays: Tensor
+    delay_std: Tensor
+    turns: Tensor
+    turn_sigmas: Tensor
+
+
+def doubt_cameras(
+    rig: CameraRig,
+    frames: KeypointFrame,
+    joints: Float[Tensor, "T J 3"],
+    fps: float,
+    exchange: Exchange,
+) -> CameraDoubts:
+    """Return by what cameras seem to be wrong, from one adjustment about the tracked joints.
+
+    Delays are those of all cameras together, with their poses free. Turns are those of one camera after the
+    other, since which of several cameras are wrong is not told by keypoints.
+
+    Args:
+        rig: two cameras or more. frames: keypoints [T, C, J]. joints: tracked. fps: frames per second.
+        exchange: of sides.
+    """
+    stride = max(1, len(joints) // _FRAMES)
+    joints = _averaged(joints, max(1, round(_WINDOW * fps) // 2))
+    none = CameraErrors.none(rig)
+    start = none.values[:, DELAY]
+
+    def adjusted(free: Tensor) -> CameraErrors:
+        given = given_for(frames, joints, start, free, fps, exchange, stride)
+        return adjust(rig, given, none, _WIDTHS).errors
+
+    together = adjusted(free_errors(len(rig), "both"))
+    turns, sigmas = torch.zeros_like(start), torch.zeros_like(start)
+    there = frames.inlier[::stride] > 0
+    for c in range(len(rig)):
+        free = torch.zeros(len(rig), DELAY + 1, dtype=torch.bool)
+        free[c] = True
+        found = adjusted(free)
+        error, rows = found.values[c], slice(c * (DELAY + 1), c * (DELAY + 1) + DELAY)
+        moves = by_pose(rig.select([c]), joints[::stride])[:, 0][there[:, c]]
+        if not len(moves):
+            continue
+        moved = (moves @ error[:DELAY]).norm(dim=-1).square().mean().sqrt()
+        turns[c] = torch.rad2deg(moved / rig.matrix[c].diagonal()[:2].mean())
+        pose, cov = error[:DELAY, None], found.cov[rows, rows]
+        chi = (pose.mT @ torch.cholesky_solve(pose, torch.linalg.cholesky(cov))).sum()
+        sigmas[c] = (chi / DELAY).sqrt()
+    return CameraDoubts(together.values[:, DELAY], together.std[:, DELAY], turns, sigmas)
+
+
+def notes_on_cameras(names: Sequence[str], doubts: CameraDoubts) -> tuple[str, ...]:
+    """Return notes on cameras that are surely and much wrong, and which option corrects them."""
+    size, std = doubts.delays.abs(), doubts.delay_std
+    late = (size > _LEAST_DELAY) & (size > _SURE_DELAY * std)
+    notes = [
+        f"camera {names[c]} seems to have begun {_in_words(doubts.delays[c], std[c])} than {names[0]}; "
+        'refine="delays" (--refine delays) corrects that'
+        for c in late.nonzero().flatten().tolist()
+    ]
+    turned = (doubts.turns > _LEAST_TURN) & (doubts.turn_sigmas > _SURE_TURN)
+    if bool(turned.any()):
+        c = int(torch.where(turned, doubts.turn_sigmas, 0).argmax())
+        notes.append(
+            f"camera {names[c]} sees joints {float(doubts.turns[c]):.1f} degrees away from where the others "
+            "have them, so the calibrated pose of this or of another camera is wrong; "
+            'refine="extrinsics" (--refine extrinsics) corrects that'
+        )
+    return tuple(notes)
+
+
+def notes_on_refined(names: Sequence[str], refined: RefinedCameras, what: str) -> tuple[str, ...]:
+    """Return notes on what was corrected, with standard deviations; or that the cameras stay as given."""
+    if refined.kept:
+        return (
+            f"refine={what!r} found nothing that explains the keypoints better: cameras as given",
+        )
+    values, std = refined.errors.values, refined.errors.std
+    notes = []
+    for c, name in enumerate(names):
+        parts = []
+        if what != "extrinsics" and c > 0:
+            parts.append(f"began {_in_words(values[c, DELAY], std[c, DELAY])} than {names[0]}")
+        if what != "delays":
+            turn, shift = values[c, :3].norm(), 100 * values[c, 3:DELAY].norm()
+            parts.append(
+                f"was turned by {_rounded(torch.rad2deg(turn), torch.rad2deg(std[c, :3].norm()), 2)} degrees "
+                f"and shifted by {_rounded(shift, 100 * std[c, 3:DELAY].norm(), 1)} cm"
+            )
+        notes += [f"refined: camera {name} {' and '.join(parts)}"] if parts else []
+    return tuple(notes)
+
+
+def _in_words(delay: Tensor, std: Tensor) -> str:
+    """Return a delay in words: who began too early has shown a moment in a later frame than others."""
+    word = "earlier" if float(delay) > 0 else "later"
+    return f"{_rounded(delay.abs(), std, 2)} frames {word}"
+
+
+def _rounded(value: Tensor, std: Tensor, digits: int) -> str:
+    return f"{float(value):.{digits}f} ± {float(std):.{digits}f}"
+
+
+def _averaged(joints: Float[Tensor, "T J 3"], reach: int) -> Float[Tensor, "T J 3"]:
+    """Return running means over so many frames before and after."""
+    flat = joints.flatten(1).T[:, None]
+    padded = torch.nn.functional.pad(flat, (reach, reach), mode="replicate")
+    return torch.nn.functional.avg_pool1d(padded, 2 * reach + 1, 1)[:, 0].T.view_as(joints)
