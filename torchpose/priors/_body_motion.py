@@ -139,16 +139,27 @@ class BodyMotion(nn.Module):
         """
         poses = self.poses
         gaps = poses.means - angles[..., None, :]
-        factor = safe_cholesky(poses.covariances + cov[..., None, :, :])
-        white = torch.linalg.solve_triangular(factor, gaps[..., None], upper=False).squeeze(-1)
-        log_size = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        log_share = poses.weights.log() - 0.5 * white.square().sum(-1) - log_size
-        share = log_share.softmax(-1)
+        share = self._log_shares(gaps, cov).softmax(-1)
         precisions = derived(self, "precisions", (poses.covariances,), self._make_precisions)
         curvature = (share @ precisions.flatten(1)).unflatten(-1, precisions.shape[1:])
         weighted = share[..., None] * gaps
         slope = torch.einsum("kij,...kj->...i", precisions, weighted)
         return PosePull(slope, curvature)
+
+    def log_density(
+        self, angles: Float[Tensor, "*batch Q"], cov: Float[Tensor, "*batch Q Q"]
+    ) -> Float[Tensor, "*batch"]:
+        """Return log sum_k pi_k N(theta; mu_k, Sigma_k + P), up to a constant; arguments as of `pull`."""
+        return self._log_shares(self.poses.means - angles[..., None, :], cov).logsumexp(-1)
+
+    def _log_shares(
+        self, gaps: Float[Tensor, "*batch K Q"], cov: Float[Tensor, "*batch Q Q"]
+    ) -> Float[Tensor, "*batch K"]:
+        """Return log pi_k N(gap_k; 0, Sigma_k + P), up to a constant."""
+        factor = safe_cholesky(self.poses.covariances + cov[..., None, :, :])
+        white = torch.linalg.solve_triangular(factor, gaps[..., None], upper=False).squeeze(-1)
+        log_size = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return self.poses.weights.log() - 0.5 * white.square().sum(-1) - log_size
 
     def _make_precisions(self) -> Tensor:
         return torch.cholesky_inverse(safe_cholesky(self.poses.covariances))

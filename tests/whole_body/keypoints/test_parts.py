@@ -9,6 +9,7 @@ from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_transition import transition
+from torchpose.whole_body._keypoints.depth_flips import flip, limb_flips
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     KeypointFrame,
@@ -18,6 +19,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     weigh,
 )
+from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_height
 from torchpose.whole_body._keypoints.upright import camera_up
@@ -176,3 +178,49 @@ def test_constants_move_with_the_filter(motion):
     found = [t for value in vars(filter).values() for t in tensors(value)]
     found += list(filter.buffers())
     assert len(found) > 20 and {t.device.type for t in found} == {"meta"}
+
+
+def test_a_flipped_limb_looks_the_same_and_keeps_its_bones(motion):
+    rig = ring(1)
+    filter = KeypointTracker(rig, 30.0, motion).filter
+    given = scene(1, 2)
+    state = start(filter, frame_of(given), 1).found.state
+    joints = filter.articulation.joints(state.mean)
+    for limb in limb_flips(BODY_15):
+        found = flip(filter, state, joints, limb)
+        moved = filter.articulation.joints(found.state.mean)
+        first, middle, last = limb.joints
+        apart = (rig(moved).pixels - rig(joints).pixels)[0, 0].norm(dim=-1)
+        assert float(apart.max()) < 40.0  # by perspective; the body is 500 pixels tall
+        for a, b, turned in ((first, middle, limb.upper), (middle, last, limb.lower)):
+            bone, before = moved[0, b] - moved[0, a], joints[0, b] - joints[0, a]
+            torch.testing.assert_close(bone.norm(), before.norm())
+            assert turned or torch.allclose(bone, before, atol=1e-6)
+        others = [j for j in range(15) if j not in (middle, last)]
+        torch.testing.assert_close(moved[:, others], joints[:, others])
+        back = flip(filter, found.state, moved, limb)
+        torch.testing.assert_close(
+            filter.articulation.joints(back.state.mean)[:, middle], joints[:, middle],
+            atol=1e-6, rtol=0,
+        )  # fmt: skip
+        torch.linalg.cholesky(found.state.cov)
+
+
+def test_the_density_of_poses_is_that_of_the_mixture(motion):
+    angles = random_point(motion.articulation).map(lambda value: value)
+    theta = motion.articulation.relative_angles(angles)
+    zero = torch.zeros(len(theta), theta.shape[1], theta.shape[1], dtype=torch.float64)
+    ours = motion.log_density(theta, zero)
+    theirs = motion.poses.log_prob(theta)
+    torch.testing.assert_close(ours[0] - ours[1], theirs[0] - theirs[1])
+
+
+def test_an_unlikely_hypothesis_becomes_another_depth_of_a_limb(motion):
+    tracker = KeypointTracker(ring(1), 10.0, motion)
+    given = scene(1, 3)
+    stream, _, _ = tracker.advance(None, frame_of(given))
+    far = torch.full_like(stream.log_weights, -1e6)
+    far[:, 0] = 0.0
+    later = [tracker.advance(stream._replace(log_weights=far), frame_of(given, 1))[0]]
+    later.append(tracker.advance(later[0], frame_of(given, 2))[0])
+    assert max(int((one.log_weights > -20).sum()) for one in later) > 1

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -18,6 +18,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
+from torchpose.whole_body._keypoints.depth_flips import flip, limb_flips
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
@@ -30,6 +31,7 @@ _SHARE = (
     0.1  # of a frame's evidence about hypotheses: its errors are like those of the frames before
 )
 _KEPT = 0.3  # seconds over which evidence about hypotheses is summed up
+_FLIP_TIME = 0.1  # seconds after which a limb is mirrored in depth
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 
@@ -40,13 +42,14 @@ class KeypointStream(NamedTuple):
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
         begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
-            been of something else.
+            been of something else. age: number of frames so far.
     """
 
     state: BodyGaussian
     log_weights: Tensor
     begun: Tensor
     lost: Tensor
+    age: int
 
 
 class KeypointPoses(NamedTuple):
@@ -96,6 +99,7 @@ class KeypointTracker(nn.Module):
             upright = camera_up(rig)
         self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
         self.n_hypotheses = _HYPOTHESES if len(rig) == 1 else 1
+        self._flips = limb_flips(motion.articulation.skeleton)
 
     def forward(
         self, frames: KeypointFrame, smoothing: bool = False, progress: bool = False
@@ -157,8 +161,29 @@ class KeypointTracker(nn.Module):
         told = _SHARE * found.log_evidence.view(count, n_each)
         weights = math.exp(-1 / (_KEPT * self.filter.fps)) * stream.log_weights + told
         weights = weights - weights.amax(-1, keepdim=True)
-        stream = stream._replace(state=found.state, log_weights=weights)
-        return stream, found
+        stream = stream._replace(state=found.state, log_weights=weights, age=stream.age + 1)
+        return self._with_flip(stream, found) if n_each > 1 else (stream, found)
+
+    def _with_flip(
+        self, stream: KeypointStream, found: CorrectedBody
+    ) -> tuple[KeypointStream, CorrectedBody]:
+        """Return hypotheses of which, now and then, the unlikeliest has become another depth of a limb."""
+        turn, wait = divmod(stream.age, max(1, round(_FLIP_TIME * self.filter.fps)))
+        if wait:
+            return stream, found
+        weights = stream.log_weights
+        best, rows = found.take(self._rows(weights.argmax(-1), weights)), weights.argmin(-1)
+        mirrored = flip(self.filter, best.state, best.joints, self._flips[turn % len(self._flips)])
+        proposed = weights.amax(-1) + mirrored.log_ratio
+        taken = (proposed > weights.amin(-1)).nonzero().squeeze(-1)
+        if not len(taken):
+            return stream, found
+        places = (taken, rows[taken])
+        changed = best._replace(state=mirrored.state).take(taken)
+        changed = changed._replace(joints=self.filter.articulation.joints(changed.state.mean))
+        found = found.put(self._rows(rows, weights)[taken], changed)
+        weights = weights.index_put(places, proposed[taken])
+        return stream._replace(state=found.state, log_weights=weights), found
 
     def _started(self, frame: KeypointFrame) -> tuple[KeypointStream, CorrectedBody]:
         """Return the likeliest hypotheses of a start."""
@@ -167,7 +192,7 @@ class KeypointTracker(nn.Module):
         zero = weights.new_zeros(count)
         begun = torch.ones(count, dtype=torch.bool, device=weights.device)
         weights = _SHARE * (weights - weights[:, :1])
-        return KeypointStream(found.state, weights, begun, zero), found
+        return KeypointStream(found.state, weights, begun, zero, 0), found
 
     def _begun_anew(
         self,
@@ -186,6 +211,7 @@ class KeypointTracker(nn.Module):
             stream.log_weights.index_copy(0, persons, new.log_weights),
             stream.begun | due,
             torch.where(due, 0.0, stream.lost),
+            stream.age,
         )
         return stream, found.put(rows, new_found)
 
@@ -197,9 +223,8 @@ class KeypointTracker(nn.Module):
         count, n_each = stream.log_weights.shape
         if n_each == 1:
             return found
-        body, first = self.filter.articulation, torch.arange(count, device=stream.lost.device)
-        best = first * n_each + stream.log_weights.argmax(-1)
-        chosen = found.take(best)
+        body = self.filter.articulation
+        chosen = found.take(self._rows(stream.log_weights.argmax(-1), stream.log_weights))
         middle = chosen.state.mean.map(lambda value: value.repeat_interleave(n_each, 0))
         weights = stream.log_weights.softmax(-1)[..., None]
         steps = body.difference(found.state.mean, middle).unflatten(0, (count, n_each))
@@ -213,6 +238,11 @@ class KeypointTracker(nn.Module):
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
         state = chosen.state._replace(mean=point, cov=(cov + cov.mT) / 2)
         return chosen._replace(state=state, joints=joints, joint_cov=joint_cov)
+
+    def _rows(self, chosen: Int[Tensor, " B"], weights: Float[Tensor, "B M"]) -> Int[Tensor, " B"]:
+        """Return the rows of one hypothesis of each element."""
+        count, n_each = weights.shape
+        return torch.arange(count, device=chosen.device) * n_each + chosen
 
     def _lost(
         self, stream: KeypointStream, frame: KeypointFrame, weighed: Weighed
