@@ -6,13 +6,15 @@ measurements twice: a hand that is not measured is missing, or it is missing and
 (`UpperBodyTracker`, `absent`). The first table measures as `torchpose track` does; in the second, MediaPipe's
 landmarks are the detector too, so it shows what a detector's hands beyond the image are good for. The
 baseline leaves a hand where it was measured last. Hands that are measured although they are outside are
-counted apart: both ways draw them where they were measured.
+counted apart: both ways draw them where they were measured. The third table takes visible hands away for 20
+frames in every 60, and tells the tracker that they are probably absent: what it costs if that is wrong.
 
     python -m benchmarks.video_borders --data DIR
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +31,7 @@ from torchpose.evaluation import Report
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.video import open_video
+from torchpose.video._recording import TrackedPerson
 
 CHOOSING = ("P08", "P12")
 """Persons on whom the two constants of `torchpose.upper_body._absence` were chosen."""
@@ -69,6 +72,14 @@ class Landmarks:
         return self._points[row : row + 1][:count], self._sure[row : row + 1][:count]
 
 
+_FALSE = 0.95  # probability that a hand which is taken away cannot be seen
+_PERIOD, _AWAY = 60, 20  # frames; the right hand is taken away half a period after the left one
+_FALSE_COLUMNS = (
+    "hands", "missing: off (widths)", "absent: off (widths)", "missing: out of view (%)",
+    "absent: out of view (%)",
+)  # fmt: skip
+
+
 class Drawn(NamedTuple):
     """Holds hands of both kinds of poses, pixels [T, 2, 2], what was measured [T, 2], and the image size."""
 
@@ -78,8 +89,25 @@ class Drawn(NamedTuple):
     size: tuple[int, int]
 
 
-def drawn(clip: Clip, prior: UpperBodyPrior, detector: Landmarks | None) -> Drawn:
-    """Return the hands of the person of a clip who is seen longest.
+class Person(NamedTuple):
+    """Holds the person of a clip who is seen longest, a tracker of poses, and the names of the keypoints."""
+
+    found: TrackedPerson
+    tracker: UpperBodyTracker
+    names: Sequence[str]
+    size: tuple[int, int]
+
+    def poses(self, keypoints: Tensor, absent: Tensor | None) -> PoseTrack:
+        """Return the poses from these keypoints [T, J, 2] and probabilities of absence [T, J]."""
+        cov, sure, absent = (
+            None if x is None else x[None]
+            for x in (self.found.covariance, self.found.confidence, absent)
+        )
+        return self.tracker(keypoints[None], sure, self.names, covariance=cov, absent=absent)
+
+
+def tracked(clip: Clip, prior: UpperBodyPrior, detector: Landmarks | None) -> Person:
+    """Return the person of a clip.
 
     Args:
         clip: the clip. prior: the prior over poses. detector: of keypoints; None measures by faces and hands.
@@ -89,23 +117,52 @@ def drawn(clip: Clip, prior: UpperBodyPrior, detector: Landmarks | None) -> Draw
         tracker = VideoTracker(prior, camera, fps=video.fps, detector=detector)
         person, *_ = tracker(video)
         options = {"fps": video.fps, "max_gap": None, "neck": tracker.tracker.neck}
-        size = video.size
-    names = tracker.measurer.names
-    cov, sure = (None if x is None else x[None] for x in (person.covariance, person.confidence))
-    plain = UpperBodyTracker(prior, camera, **options)(
-        person.keypoints[None], sure, names, covariance=cov
-    )
-    n_frames = len(clip.labels.nose)
+        poses = UpperBodyTracker(prior, camera, **options)
+        return Person(person, poses, tracker.measurer.names, video.size)
 
-    def placed(values: Tensor, nothing: float | bool) -> Tensor:
-        whole = torch.full((n_frames, *values.shape[1:]), nothing, dtype=values.dtype)
-        values = values[: n_frames - person.first_frame]
-        whole[person.first_frame :][: len(values)] = values
-        return whole
 
-    hands = (track.joints2d[0][:, _HANDS] for track in (plain, person.track))
-    missing, absent = (placed(x, torch.nan) for x in hands)
-    return Drawn(missing, absent, placed(plain.observed[0][:, _HANDS], False), size)
+def placed(values: Tensor, first: int, n_frames: int, nothing: float | bool) -> Tensor:
+    """Return the values of a person who is there from a frame on, in frames of the clip."""
+    whole = torch.full((n_frames, *values.shape[1:]), nothing, dtype=values.dtype)
+    values = values[: n_frames - first]
+    whole[first:][: len(values)] = values
+    return whole
+
+
+def drawn(clip: Clip, person: Person) -> Drawn:
+    """Return the hands of the person of a clip, with the evidence of their absence and without."""
+    plain = person.poses(person.found.keypoints, None)
+    where = person.found.first_frame, len(clip.labels.nose)
+    hands = (track.joints2d[0][:, _HANDS] for track in (plain, person.found.track))
+    missing, absent = (placed(x, *where, torch.nan) for x in hands)
+    return Drawn(missing, absent, placed(plain.observed[0][:, _HANDS], *where, False), person.size)
+
+
+def false_absence(clip: Clip, person: Person) -> list[float] | None:
+    """Return a row of the third table; None of a clip without visible hands to take away."""
+    found, labels = person.found, clip.labels
+    where, rows = (found.first_frame, len(labels.nose)), []
+    away = torch.zeros(len(found), 2, dtype=torch.bool)
+    keypoints = found.keypoints.clone()
+    absent = torch.full_like(keypoints[..., 0], torch.nan)
+    frames = torch.arange(len(found)) + found.first_frame - _AWAY
+    for hand, side in enumerate(("left", "right")):
+        joint = person.names.index(f"hand_{side}")
+        apart = (frames - hand * _PERIOD // 2) % _PERIOD
+        away[:, hand] = (apart < _AWAY) & keypoints[:, joint].isfinite().all(-1)
+        keypoints[away[:, hand], joint] = torch.nan
+        absent[away[:, hand], joint] = _FALSE
+    scored = placed(away, *where, False) & (labels.seen[:, :2] == 1)
+    if not bool(scored.any()):
+        return None
+    size = torch.tensor(person.size, dtype=torch.float64)
+    for given in (None, absent):
+        hands = placed(person.poses(keypoints, given).joints2d[0][:, _HANDS], *where, torch.nan)
+        off = (hands - labels.centres[:, :2]).norm(dim=-1)[scored] / labels.width
+        inside = ((hands >= 0) & (hands < size)).all(-1)[scored]
+        rows.append((float(off.nanmedian()), 100 * float((~inside).double().mean())))
+    (plain, plain_out), (told, told_out) = rows
+    return [int(scored.sum()), plain, told, plain_out, told_out]
 
 
 def last_places(points: Tensor, measured: Tensor) -> Tensor:
@@ -146,14 +203,20 @@ def score(labels: Labels, found: Drawn) -> list[float] | None:
 
 
 def add_table(
-    report: Report, key: str, title: str, rows: dict[str, tuple[str, list[float]]]
+    report: Report,
+    key: str,
+    title: str,
+    rows: dict[str, tuple[str, list[float]]],
+    columns: Sequence[str] = _COLUMNS,
+    digits: tuple[int, ...] = (0, 0, 0, 0, 0, 2, 2, 0, 0, 0),
 ) -> None:
     """Add the rows of all clips, and their means over both groups of persons.
 
     Args:
         report: of the benchmark. key, title: of the table. rows: by clip, with the person.
+        columns, digits: of the table.
     """
-    table = report.table(key, title, list(_COLUMNS), digits=(0, 0, 0, 0, 0, 2, 2, 0, 0, 0))
+    table = report.table(key, title, list(columns), digits=digits)
     for name, (person, row) in rows.items():
         table.add(f"{name} ({person})", row)
     for title, chosen in (("mean of persons chosen on", True), ("mean of the others", False)):
@@ -180,7 +243,7 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    clips = [clip for clip in read_clips(data) if clip.name in PEOPLE]
+    clips = read_clips(data)
     if quick:
         clips = [clip for clip in clips if clip.name == "akstheme_gesture"]
     fitted = load_prior(prior)
@@ -189,15 +252,22 @@ def main(
         "measured": "Measured by faces and hands",
         "detected": "MediaPipe's landmarks as the detector",
     }
+    taken: dict[str, tuple[str, list[float]]] = {}
     for key, title in titles.items():
         rows = {}
         for clip in clips:
             path = clip.path.parent / f"{clip.name}_mediapipe_pose1.npz"
-            detector = Landmarks(path) if key == "detected" else None
-            row = score(clip.labels, drawn(clip, fitted, detector))
+            person = tracked(clip, fitted, Landmarks(path) if key == "detected" else None)
+            row = score(clip.labels, drawn(clip, person)) if clip.name in PEOPLE else None
             if row is not None:
                 rows[clip.name] = clip.person, row
+            row = false_absence(clip, person) if key == "measured" else None
+            if row is not None:
+                taken[clip.name] = clip.person, row
         add_table(report, key, title, rows)
+        clips = [clip for clip in clips if clip.name in rows]
+    title = "Visible hands that are taken away, and said to be absent"
+    add_table(report, "false", title, taken, _FALSE_COLUMNS, (0, 2, 2, 0, 0))
     text = "\n\n".join(table.to_markdown() for table in report.values())
     print(text)
     if out:

@@ -251,7 +251,8 @@ class UpperBodyTracker(WideModule):
             absent: [B, T, J], the probability that a missing hand cannot be seen, because it is hidden or
                 outside of the image, as a detector has it at even odds; NaN where nothing is known. A hand
                 is then expected beyond the borders of the image rather than in it, by "multiple-model",
-                "articulated" and "window-mixture". Needs a camera with the size of its image.
+                "articulated" and "window-mixture", whose log-evidence includes it. Needs a camera with the
+                size of its image.
 
         Returns:
             `PoseTrack`.
