@@ -18,7 +18,7 @@ from torchpose.demo._rendering import render_video
 from torchpose.measure import HandTracker, UpperBodyMeasurer
 from torchpose.measure._body_window import CELLS, pixels_to_cells
 from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
-from torchpose.measure._hand_network import HandNetwork, HandPlaces
+from torchpose.measure._hand_network import HandNetwork, HandPlaces, shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.video import open_video
@@ -198,6 +198,27 @@ def measure(
             if row is not None:
                 hands = HandMeasurements(*(value[row] for value in found.hands))
                 yield t, row, hands, state.hands.anchors[row]
+
+
+def found_hands(clip: Clip) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """Return the hands that `torchpose track` measures in a clip, and the size of its image.
+
+    Args:
+        clip: with its labels.
+
+    Returns:
+        Points [T, 2, 2], pixels, NaN where missing, and variances of a coordinate [T, 2].
+    """
+    n_frames = len(clip.labels.nose)
+    points = torch.full((n_frames, 2, 2), torch.nan, dtype=torch.float64)
+    variance = torch.ones(n_frames, 2, dtype=torch.float64)
+    with open_video(clip.path) as video:
+        size, prior = video.size, HandPrior.from_prior(load_prior("kinect-upper-body"))
+        tracker = HandTracker(prior, fps=video.fps, network=shipped_hand_network())
+    for t, _, hands, _ in measure(clip, tracker):
+        points[t] = torch.where(hands.seen[:, None], hands.points, torch.nan)
+        variance[t] = hands.covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+    return points, variance, size
 
 
 def _person(faces: Float[Tensor, "N 3"], nose: Float[Tensor, " 2"]) -> int | None:

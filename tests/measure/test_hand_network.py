@@ -162,6 +162,8 @@ def test_hands_that_are_gone_are_not_seen_and_come_back():
     seen = [bool(hands.seen.all()) for hands in out]
     assert all(seen[3:5]) and not any(seen[8:13]) and all(seen[16:])
     assert 0 < float(state.gone.amax()) < 0.05
+    assert torch.equal(out[-1].absent.float(), state.gone.float())
+    assert float(out[12].absent.amin()) > 0.9
 
 
 def test_how_long_a_hand_stays_gone_does_not_depend_on_the_frame_rate():
@@ -249,8 +251,9 @@ def test_what_learns_is_not_folded():
 
 
 def test_without_a_network_no_hand_is_gone():
-    _, (state, _) = tracked(None, frames=2)
+    _, (state, out) = tracked(None, frames=2)
     assert not bool(state.gone.any())
+    assert bool(out[-1].absent.isnan().all())
 
 
 def test_an_even_network_leaves_places_to_the_other_cues():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose import UpperBodyTracker, VideoTracker
+from torchpose import PinholeCamera, UpperBodyTracker, VideoTracker
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.measure import HaarFaceDetector
@@ -140,6 +140,30 @@ def test_several_persons_have_poses_of_their_own(prior):
     assert found.person.tolist() == [0, 1] and sorted(poses) == [0, 1] and found.faces is None
     for person, again in zip(people, tracker(FRAMES), strict=True):
         assert torch.equal(again.track.joints3d, person.track.joints3d)
+
+
+@pytest.mark.parametrize("smoothing", [None, "full"])
+def test_a_hand_outside_of_the_image_is_expected_there(prior, smoothing):
+    """Poses are those of the keypoint tracker that is told so; a camera without a size is not told."""
+    detector = Performers(0.0)
+    hand = UPPER_BODY.index("hand_left")
+    detector.points[10:, 0, hand, 1] = 600.0
+    kept = slice(FIRST, None)
+    keypoints = detector.points[None, kept, 0].clone()
+    keypoints[0, 10 - FIRST :, hand] = torch.nan
+    absent = torch.full_like(keypoints[..., 0], torch.nan)
+    absent[0, 10 - FIRST :, hand] = float(np.float32(0.95))
+    sure = torch.where(keypoints[..., 0].isfinite(), detector.sure[None, kept, 0], 0.0)
+    sized = PinholeCamera(*CAMERA.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), 640, 480)
+    unsized = PinholeCamera(*CAMERA.matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+    options = {"method": "articulated", "fps": 30.0, "smoothing": smoothing}
+    for camera, given in ((sized, absent), (unsized, None)):
+        (person,) = VideoTracker(prior, camera, detector=detector, **options)(FRAMES)
+        torch.testing.assert_close(person.absent, absent[0], equal_nan=True)
+        told = UpperBodyTracker(prior, camera, **options)(
+            keypoints, sure, detector.names, absent=given
+        )
+        same(person.track, told)
 
 
 def test_wrists_choose_the_method_as_in_files(prior):

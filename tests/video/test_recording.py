@@ -71,6 +71,29 @@ def frames(keypoints, present):
     return found
 
 
+def test_absent_hands_reach_the_tracker(tracker, keypoints):
+    """Of a person whose right hand is missing throughout, and cannot be seen."""
+    points = keypoints.clone()
+    points[:, MEASURED.index("hand_right")] = torch.nan
+    gone = torch.tensor([[0.01, 0.99]])
+    found = [
+        frame._replace(hands=frame.hands._replace(absent=gone))
+        for frame in frames(points, [[0]] * 20)
+    ]
+    (person,) = record(tracker, found, 8)
+    absent = torch.full((1, 20, len(MEASURED)), torch.nan, dtype=torch.float64)
+    absent[..., 2:] = gone
+    torch.testing.assert_close(person.absent, absent[0], equal_nan=True)
+    cov = COV.double().expand(1, 20, -1, -1, -1)
+    told = tracker(points[None, :20], names=MEASURED, covariance=cov, absent=absent)
+    for name in FIELDS:
+        torch.testing.assert_close(
+            getattr(person.track, name), getattr(told, name), rtol=1e-9, atol=1e-9
+        )
+    plain = tracker(points[None, :20], names=MEASURED, covariance=cov)
+    assert not torch.allclose(plain.joints3d, told.joints3d)
+
+
 def record(tracker, found, size, smoother=None):
     stream, states = PersonStream(tracker, MEASURED), {}
     kept = TrackedRecording(tracker, MEASURED, GAP)

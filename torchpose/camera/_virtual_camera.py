@@ -28,6 +28,7 @@ __all__ = [
     "log_magnification",
     "memory_frames",
     "path_regression",
+    "planes_in_view",
     "to_view",
     "view_body",
     "view_jacobian",
@@ -314,6 +315,21 @@ def view_jacobian(
     homography = homography[..., None, :, :]
     slopes = homography[..., :2, :2] - value * homography[..., 2:, :2]
     return slopes / (depth * view.zoom[..., None, None, None])
+
+
+def planes_in_view(
+    planes: Float[Tensor, "P 3"], view: BodyView, matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "B T P 3"]:
+    """Return half-planes of the camera's pixels, a (u, v) + b > 0, in those of the virtual camera.
+
+    Args:
+        planes: (a, b). view: the virtual camera. matrix: K.
+    """
+    turned = planes @ _homography(view.rotation.mT, matrix)
+    slope = turned[..., :2] / view.zoom[..., None, None]
+    shift = (turned[..., :2] * view.centre[..., None, :]).sum(-1)
+    zoomed = (slope * view.centre[..., None, :]).sum(-1)
+    return torch.cat([slope, (turned[..., 2] + shift - zoomed)[..., None]], -1)
 
 
 def log_magnification(

@@ -30,7 +30,13 @@ from torchpose.filters._weights import WeightRule, estimate_of, frame_weights
 from torchpose.math._gaussian import Gain, kalman_gain
 from torchpose.math._geometric_median import median_estimate
 
-__all__ = ["frame_evidence", "frame_log_likelihood", "run_memoryless", "step_memoryless"]
+__all__ = [
+    "conditioned_groups",
+    "frame_evidence",
+    "frame_log_likelihood",
+    "run_memoryless",
+    "step_memoryless",
+]
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
@@ -62,6 +68,26 @@ def frame_evidence(
         (group.rows, _weighed(rule, group, _log_likelihood(model, group))[1]) for group in groups
     ]
     return _in_order(found).unflatten(0, frames.z.shape[:2])
+
+
+def conditioned_groups(
+    model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
+) -> Iterator[tuple["_Group", Tensor, Tensor, Tensor]]:
+    """Yield groups of frames with the posterior of every component given each frame.
+
+    Yields:
+        A group, whose `rows` are the places of its N frames among all; means [N, M, D], the covariances that
+        the frames share [M, D, D], and log-weights [N, M].
+    """
+    z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
+    noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
+    for same in _alike(mask, noise):
+        own_noise = frames.cov if noise is None else noise[same[0]]
+        for rows in same.split(_RECOMPUTED_FRAMES):
+            group = _Group(rows, z[rows], mask[same[0]], own_noise)
+            gain, covs = _gain(model, group)
+            means, log_likelihood, _ = _condition(model, measured_parts(model), group, gain)
+            yield group, means, covs, _weighed(rule, group, log_likelihood)[0]
 
 
 def run_memoryless(

@@ -268,6 +268,8 @@ class HandMeasurements(NamedTuple):
         mass: probability that the hand is there.
         seen: False where a hand is lost, to be taken as missing.
         elbows: the elbows, by a tracker with a network. elbow_covariance, elbow_seen: of these.
+        absent: probability that a hand cannot be seen, hidden or outside of the image, by a tracker with a
+            network; else NaN.
     """
 
     points: Float[Tensor, "N 2 2"]
@@ -277,6 +279,7 @@ class HandMeasurements(NamedTuple):
     elbows: Float[Tensor, "N 2 2"]
     elbow_covariance: Float[Tensor, "N 2 2 2"]
     elbow_seen: Bool[Tensor, "N 2"]
+    absent: Float[Tensor, "N 2"]
 
 
 def without_elbows(
@@ -284,11 +287,13 @@ def without_elbows(
     covariance: Float[Tensor, "N 2 2 2"],
     mass: Float[Tensor, "N 2"],
     seen: Bool[Tensor, "N 2"],
+    absent: Float[Tensor, "N 2"] | None = None,
 ) -> HandMeasurements:
     """Return the measurements of hands without elbows, which are NaN and not seen."""
     return HandMeasurements(
         points, covariance, mass, seen,
         torch.full_like(points, torch.nan), torch.zeros_like(covariance), torch.zeros_like(seen),
+        torch.full_like(points[..., 0], torch.nan) if absent is None else absent,
     )  # fmt: skip
 
 

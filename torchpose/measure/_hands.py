@@ -371,7 +371,8 @@ class HandTracker(nn.Module):
         speed = state.speed.lerp(step * s.velocity, 0.5)
         shown = torch.where(there[..., None], points, torch.nan)
         state = state._replace(place=points, speed=speed, frames=state.frames + 1)
-        return state, without_elbows(shown, covariance, found.mass, seen)
+        absent = None if self.network is None else state.gone.to(shown)
+        return state, without_elbows(shown, covariance, found.mass, seen, absent)
 
 
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:

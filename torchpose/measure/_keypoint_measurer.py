@@ -35,6 +35,9 @@ __all__ = ["LEAST_CONFIDENCE", "FrameKeypoints", "KeypointMeasurer", "KeypointSt
 LEAST_CONFIDENCE = 0.3
 """Of a keypoint, below which it counts as missing unless something else is asked for."""
 _ANYWHERE = ("head", "neck")  # may lie above the image: they follow from face and shoulders
+_BEYOND = (
+    0.95  # probability that a keypoint cannot be seen which a detector puts outside of the image
+)
 _KNOWN_FOR = 30.0  # seconds for which somebody who has left is remembered
 _PRESENT = 1.0  # seconds for which somebody who is not detected counts as there
 _CROPPED = 0.2  # seconds without a detection after which the whole image is searched
@@ -47,12 +50,14 @@ class FrameKeypoints(NamedTuple):
         person: their numbers, in the order of appearance [N].
         keypoints: of the measurer's `names` [N, J, 2], pixels, NaN where missing.
         confidence: 0 to 1 [N, J]. sizes: about the widths of the shoulders, pixels [N].
+        absent: the probability that a keypoint cannot be seen, NaN where nothing is known [N, J].
     """
 
     person: Int[Tensor, " N"]
     keypoints: Float[Tensor, "N J 2"]
     confidence: Float[Tensor, "N J"]
     sizes: Float[Tensor, " N"]
+    absent: Float[Tensor, "N J"]
 
     @property
     def faces(self) -> None:
@@ -131,13 +136,15 @@ class KeypointMeasurer:
         """
         check_rgb("a frame", image)
         found = self._sure(self._detect(state.tracks, image), image)
-        found = _rows(found, without_doubles(found, self._scale(found.keypoints)[1], self._upper))
+        scale = self._scale(found.keypoints)[1]
+        found = _rows(found, without_doubles(Detections(*found[:2]), scale, self._upper))
         before = self._scale(state.tracks.keypoints)[1]
         tracks, owner = associate(state.tracks, found.keypoints, before, self._upper)
         persons, number = self._number(state, tracks, image)
         chosen = self._chosen(number[owner], found)
         found, number = _rows(found, chosen), number[owner][chosen]
-        measured = FrameKeypoints(number, *found, self._scale(found.keypoints)[1])
+        size = self._scale(found.keypoints)[1]
+        measured = FrameKeypoints(number, found.keypoints, found.confidence, size, found.absent)
         return KeypointState(tracks, persons, state.frame + 1), measured
 
     def _detect(self, tracks: PersonTracks, image: Image) -> Detections:
@@ -173,7 +180,7 @@ class KeypointMeasurer:
     def _scale(self, keypoints: Tensor) -> tuple[Tensor, Tensor]:
         return person_scale(keypoints, self.names)
 
-    def _sure(self, found: Detections, image: Image) -> Detections:
+    def _sure(self, found: Detections, image: Image) -> "_Sure":
         """Return the persons with enough keypoints, without those that are unsure or not in the image."""
         sure = (found.confidence >= self.min_confidence) & (found.confidence > 0)
         size = found.keypoints.new_tensor([image.shape[1], image.shape[0]])
@@ -182,7 +189,9 @@ class KeypointMeasurer:
         keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
         there = sure[:, self._upper].sum(1) >= least_seen(len(self._upper))
         confidence = torch.where(sure, found.confidence, 0.0)
-        return Detections(keypoints[there], confidence[there])
+        beyond = found.keypoints.isfinite().all(-1) & ~inside
+        absent = torch.where(beyond, _BEYOND, torch.nan).to(confidence)
+        return _Sure(keypoints[there], confidence[there], absent[there])
 
     def _number(
         self, state: KeypointState, tracks: PersonTracks, image: Image
@@ -198,7 +207,7 @@ class KeypointMeasurer:
         numbers[present] = number
         return persons, numbers
 
-    def _chosen(self, number: Int[Tensor, " N"], found: Detections) -> Int[Tensor, " n"]:
+    def _chosen(self, number: Int[Tensor, " N"], found: "_Sure") -> Int[Tensor, " n"]:
         """Return the rows of the persons who count, the largest if there are too many."""
         rows = torch.nonzero(number >= 0).flatten()
         if self.max_persons is None or len(rows) <= self.max_persons:
@@ -207,5 +216,17 @@ class KeypointMeasurer:
         return rows[size.argsort(descending=True)[: self.max_persons].sort().values]
 
 
-def _rows(found: Detections, rows: Int[Tensor, " n"]) -> Detections:
-    return Detections(*(values[rows] for values in found))
+class _Sure(NamedTuple):
+    """Holds `Detections` without unsure keypoints.
+
+    Attributes:
+        keypoints, confidence: NaN and 0 where missing. absent: as in `FrameKeypoints`.
+    """
+
+    keypoints: Tensor
+    confidence: Tensor
+    absent: Tensor
+
+
+def _rows(found: _Sure, rows: Int[Tensor, " n"]) -> _Sure:
+    return _Sure(*(values[rows] for values in found))

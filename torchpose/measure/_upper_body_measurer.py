@@ -38,6 +38,7 @@ __all__ = [
 MEASURED = ("head", "neck", "hand_left", "hand_right")
 """Names and order of the joints that are always measured; elbows follow if they are measured."""
 _ELBOWS = ("elbow_left", "elbow_right")
+_HANDS = [MEASURED.index("hand_left"), MEASURED.index("hand_right")]
 HAND_TRACKERS = ("learnt", "grid", "mean-shift")
 """Names of the hand trackers, the default first."""
 
@@ -62,6 +63,13 @@ class FrameMeasurements(NamedTuple):
     covariance: Float[Tensor, "N J 2 2"]
     faces: Float[Tensor, "N 3"]
     hands: HandMeasurements
+
+    @property
+    def absent(self) -> Float[Tensor, "N J"]:
+        """Return the probability that a joint cannot be seen [N, J]; NaN where nothing is known."""
+        absent = torch.full_like(self.keypoints[..., 0], torch.nan)
+        absent[:, _HANDS] = self.hands.absent.to(absent)
+        return absent
 
 
 class Candidates(NamedTuple):

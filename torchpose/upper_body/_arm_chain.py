@@ -15,6 +15,7 @@ from torch.nn.functional import normalize, pad
 from torchpose._core.module_state import outside_inference
 from torchpose.priors._arms import ArmPrior
 from torchpose.priors._gaussian_mixture import LOG_2PI
+from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, sphere_points
 
 __all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity", "mirrored"]
@@ -43,6 +44,8 @@ class ArmInput(NamedTuple):
         variance: the variance across the rays of elbow and hand, metres squared, [B, 2, M, 2].
         axes: the rotation from camera to upright axes, [B, M, 3, 3].
         lengths: the lengths of both bones, metres, [B, 2, M, 2].
+        borders: the planes of the image's borders, then the optical axis, [B, 2, M, P + 1, 3]; None where
+            nothing is known of hands that are not measured. log_inside: see `Absence`, [B, 2].
     """
 
     shoulder: Tensor
@@ -52,6 +55,8 @@ class ArmInput(NamedTuple):
     variance: Tensor
     axes: Tensor
     lengths: Tensor
+    borders: Tensor | None = None
+    log_inside: Tensor | None = None
 
 
 class Arms(NamedTuple):
@@ -240,7 +245,13 @@ class ArmChain:
         shape = *start.shape[:-1], sizes[1], 3
         bones = upper.directions[..., None, :], lower.directions
         directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
-        weight = (upper.log_weight[..., None] + lower.log_weight).flatten(-2)
+        weight = upper.log_weight[..., None] + lower.log_weight
+        if not hand and arm.borders is not None and arm.log_inside is not None:
+            borders, log_inside = meant(arm.borders)[..., None, :, :], meant(arm.log_inside)
+            weight = weight + log_beyond(
+                lower.ends, borders[..., :-1, :], borders[..., -1, :], log_inside[..., None, None]
+            )
+        weight = weight.flatten(-2)
         prior = self.density(directions)
         if weight.shape[-1] <= count:
             return Arms(directions, weight, prior)

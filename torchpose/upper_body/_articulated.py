@@ -214,7 +214,9 @@ class ArticulatedFilter(Estimator):
         """Yield the result of each frame."""
         if self.middle_alone:
             measured = with_middle(measured)
-        frames = zip(split(as_rays(measured, self.matrix)), facts_of(measured), strict=True)
+        frames = zip(
+            split(as_rays(measured, self.matrix)), facts_of(measured, self.matrix), strict=True
+        )
         before, sizes = self.grid.moments(state.root), self.lengths.sizes(state.lengths)
         for frame, facts in tqdm([*frames], disable=not progress, desc="frames"):
             step = self._step(state, frame, facts, before, sizes)

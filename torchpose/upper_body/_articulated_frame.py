@@ -85,6 +85,7 @@ class RayFrame(NamedTuple):
             beyond them, [B]. It is where hands are the only limbs, since elbows are sharper than a trend. A
             torso of one joint has no size in the image, and arms alone are a poor witness of how far it is.
         face: the confidence of nose, eyes and ears, [B, 5]; None if there are none.
+        log_inside: see `Absence`, 0 where a hand is measured, [B, 2]; None without any evidence.
     """
 
     rays: Tensor
@@ -99,6 +100,7 @@ class RayFrame(NamedTuple):
     stiff: Tensor
     extrapolates: Tensor
     face: Tensor | None
+    log_inside: Tensor | None = None
 
 
 class Facts(NamedTuple):
@@ -108,12 +110,14 @@ class Facts(NamedTuple):
         patterns: the pairs of whether elbow and hand are measured that there are among all arms.
         sided: whether any shoulder is measured. leaning: whether both of anybody are.
         expected: which of nose, eyes and ears are among the keypoints at all, [5]; None without any.
+        borders: the planes of the image's borders, K^T (a, b) of `Absence`, [P, 3]; None without any.
     """
 
     patterns: list[tuple[bool, bool]]
     sided: bool
     leaning: bool
     expected: Tensor | None
+    borders: Tensor | None = None
 
 
 class UprightFrame(NamedTuple):
@@ -123,6 +127,7 @@ class UprightFrame(NamedTuple):
         rays: of the eight joints, [B, 8, 3]. limbs: of elbow and hand of both arms, [B, 2, 2, 3].
         torso: the rays of the torso. face: nose, eyes and ears, or None.
         given: the measurements. facts: what holds for them.
+        borders: the planes of the image's borders, then the optical axis, [B, P + 1, 3]; None without any.
     """
 
     rays: Tensor
@@ -131,6 +136,7 @@ class UprightFrame(NamedTuple):
     face: FacePoints | None
     given: RayFrame
     facts: Facts
+    borders: Tensor | None = None
 
 
 def upright(frame: RayFrame, facts: Facts, tilt: Float[Tensor, "B 3 3"]) -> UprightFrame:
@@ -142,7 +148,8 @@ def upright(frame: RayFrame, facts: Facts, tilt: Float[Tensor, "B 3 3"]) -> Upri
     if frame.face is not None and facts.expected is not None:
         face = FacePoints(rows[:, _LIFTS.stop :, :2], frame.face, facts.expected)
     limbs = rows[:, _LIMBS].unflatten(1, (2, 2))
-    return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts)
+    borders = None if facts.borders is None else facts.borders @ tilt
+    return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts, borders)
 
 
 def as_rays(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> RayFrame:
@@ -170,12 +177,16 @@ def as_rays(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> RayFrame:
     return RayFrame(
         torch.cat(rows, -2), known, std, exact, torso, torso_std, lifted, limbs,
         *_noise_along(std, known), (torso.sum(-1) > 1) & ~limbs[..., 0].any(-1),
-        None if face is None else face.confidence,
+        None if face is None else face.confidence, _log_inside(measured),
     )  # fmt: skip
 
 
-def facts_of(measured: MeasuredJoints) -> list[Facts]:
-    """Return what holds for each of T frames; values are looked at once for all of them."""
+def facts_of(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> list[Facts]:
+    """Return what holds for each of T frames; values are looked at once for all of them.
+
+    Args:
+        measured: the measurements, [B, T, ...]. matrix: K of the prior's camera.
+    """
     known = measured.mask
     limbs = known[..., list(_ROWS[_LIMBS])].unflatten(-1, (2, 2))
     code = 2 * limbs[..., 0].long() + limbs[..., 1]
@@ -183,10 +194,30 @@ def facts_of(measured: MeasuredJoints) -> list[Facts]:
     shoulders = known[..., SHOULDERS]
     sides = torch.stack([shoulders.any(-1), shoulders.all(-1)], -1).any(0)
     expected = None if measured.face is None else measured.face.expected
-    return [
-        Facts([ends for ends, here in zip(_ENDS, row, strict=True) if here], some, both, expected)
-        for row, (some, both) in zip(there.tolist(), sides.tolist(), strict=True)
+    borders = _borders(measured, matrix)
+    patterns = [
+        [ends for ends, here in zip(_ENDS, row, strict=True) if here] for row in there.tolist()
     ]
+    return [
+        Facts(found, some, both, expected, borders)
+        for found, (some, both) in zip(patterns, sides.tolist(), strict=True)
+    ]
+
+
+def _log_inside(measured: MeasuredJoints) -> Float[Tensor, "B T 2"] | None:
+    """Return the evidence of hands that are not measured, 0 for the others."""
+    if measured.absence is None:
+        return None
+    return measured.absence.log_inside.masked_fill(measured.mask[..., HANDS], 0.0)
+
+
+def _borders(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> Tensor | None:
+    """Return the planes through the camera and the borders of the image, and the optical axis."""
+    log_inside = _log_inside(measured)
+    if measured.absence is None or log_inside is None or not bool((log_inside < 0).any()):
+        return None
+    axis = matrix.new_tensor([[0.0, 0.0, 1.0]])
+    return torch.cat([measured.absence.planes @ matrix, axis])
 
 
 def split(frames: RayFrame) -> list[RayFrame]:

@@ -166,9 +166,13 @@ def _arm_input(
     places = torch.cat([shoulders[..., None, :], limbs], -2) @ axes.mT[:, None]
     shoulder, rays = mirrored(places).split([1, 2], -2)
     bones = lengths[:, None, None, :2].expand(*shoulders.shape[:3], 2)
+    borders = None
+    if frame.borders is not None:
+        turned = (frame.borders[:, None] @ axes.mT)[:, None].expand(-1, 2, -1, -1, -1)
+        borders = mirrored(turned)
     return ArmInput(
         shoulder[..., 0, :], rays, given.limbs, frame.facts.patterns,
-        noise[:, :, None] * depth.square() + loose, axes, bones,
+        noise[:, :, None] * depth.square() + loose, axes, bones, borders, given.log_inside,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
 from torchpose.skeleton._upper_body import ARM_JOINTS
+from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._face_points import FacePoints, measure_face
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
@@ -67,6 +68,7 @@ class MeasuredJoints(NamedTuple):
         middle: the point by which the neck was put (`place_measured_neck`); None where the neck itself was
             measured.
         confidence: the confidence of the detector, [B, T, 8], 1 where missing; None where it gives none.
+        absence: the evidence that missing hands are outside of the image; None without any.
     """
 
     uv: Tensor
@@ -75,6 +77,7 @@ class MeasuredJoints(NamedTuple):
     face: FacePoints | None = None
     middle: MiddlePoint | None = None
     confidence: Tensor | None = None
+    absence: Absence | None = None
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:

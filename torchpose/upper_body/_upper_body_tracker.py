@@ -21,6 +21,7 @@ from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._absence import HANDS, absence_of
 from torchpose.upper_body._estimator import (
     Estimator,
     TrackerModel,
@@ -230,6 +231,7 @@ class UpperBodyTracker(WideModule):
         lengths: Int[Tensor, " B"] | None = None,
         progress: bool = False,
         covariance: Float[Tensor, "B T J 2 2"] | None = None,
+        absent: Float[Tensor, "B T J"] | None = None,
     ) -> PoseTrack:
         """Track a batch of sequences.
 
@@ -246,6 +248,11 @@ class UpperBodyTracker(WideModule):
             covariance: [B, T, J, 2, 2], the covariance of each keypoint in pixels squared, in place of
                 `measurement_std`; that of a missing keypoint is ignored. Frames with the same
                 covariances share work.
+            absent: [B, T, J], the probability that a missing hand cannot be seen, because it is hidden or
+                outside of the image, as a detector has it at even odds; NaN where nothing is known. A hand
+                is then expected beyond the borders of the image rather than in it, by "multiple-model",
+                "articulated" and "window-mixture", whose log-evidence includes it. Needs a camera with the
+                size of its image.
 
         Returns:
             `PoseTrack`.
@@ -258,7 +265,7 @@ class UpperBodyTracker(WideModule):
         with one_run(self.measurement_cov.device):
             keypoints = check_sequences(keypoints).to(self.measurement_cov)
             picked = self._pick(keypoints.shape[2], names)
-            given = self._measure(keypoints, confidence, mask, covariance, picked)
+            given = self._measure(keypoints, confidence, mask, covariance, absent, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             there = given.mask.flatten(0, 1).any(0).tolist()
             reader = self._reader(there, picked)
@@ -317,6 +324,7 @@ class UpperBodyTracker(WideModule):
         confidence: Float[Tensor, "B J"] | None = None,
         mask: Bool[Tensor, "B J"] | None = None,
         covariance: Float[Tensor, "B J 2 2"] | None = None,
+        absent: Float[Tensor, "B J"] | None = None,
     ) -> tuple[StreamState, LivePose]:
         """Track one more frame of each stream: the same numbers as that frame of `forward`.
 
@@ -327,8 +335,8 @@ class UpperBodyTracker(WideModule):
         Args:
             state: the state from `init` or the step before; it is not changed, so a step may be repeated
                 (but a generator goes on).
-            keypoints, confidence, mask, covariance: the measurements of one frame, as in `forward`,
-                without T.
+            keypoints, confidence, mask, covariance, absent: the measurements of one frame, as in
+                `forward`, without T.
 
         Returns:
             The next state, and the `LivePose` of this frame.
@@ -337,7 +345,7 @@ class UpperBodyTracker(WideModule):
             ShapeError, InputError: wrong shapes, infinite values.
         """
         check_shape("keypoints", keypoints, [len(state.unseen), state.n_keypoints, 2])
-        given = (None if x is None else x[:, None] for x in (confidence, mask, covariance))
+        given = (None if x is None else x[:, None] for x in (confidence, mask, covariance, absent))
         state, track = self.advance(state, keypoints[:, None], *given)
         return state, live_pose(track, state.unseen / (self.fps or 30.0))
 
@@ -348,14 +356,15 @@ class UpperBodyTracker(WideModule):
         confidence: Float[Tensor, "B T J"] | None = None,
         mask: Bool[Tensor, "B T J"] | None = None,
         covariance: Float[Tensor, "B T J 2 2"] | None = None,
+        absent: Float[Tensor, "B T J"] | None = None,
     ) -> tuple[StreamState, PoseTrack]:
         """Track some more frames of each stream: the same numbers as `step` for one after the other.
 
         Long recordings are tracked so in bounded memory, and quicker than frame by frame.
 
         Args:
-            state: as in `step`. keypoints, confidence, mask, covariance: the measurements of these
-                frames, as in `forward`.
+            state: as in `step`. keypoints, confidence, mask, covariance, absent: the measurements of
+                these frames, as in `forward`.
 
         Returns:
             The next state, and the poses of these frames.
@@ -370,7 +379,7 @@ class UpperBodyTracker(WideModule):
             raise InputError("keypoints must hold at least one frame, got none")
         with one_run(self.measurement_cov.device):
             keypoints = keypoints.to(self.measurement_cov)
-            given = self._measure(keypoints, confidence, mask, covariance, state.picked)
+            given = self._measure(keypoints, confidence, mask, covariance, absent, state.picked)
             reader = self._reader(state.picked.there, state.picked)
             screen, found = screen_joints(self._screen(state.picked), state.screen, given)
             own, estimates = reader.estimator.advance(state.estimator, found.measured)
@@ -394,12 +403,21 @@ class UpperBodyTracker(WideModule):
         confidence: Tensor | None,
         mask: Tensor | None,
         covariance: Tensor | None,
+        absent: Tensor | None,
         picked: Picked,
     ) -> MeasuredJoints:
-        return in_prior_pixels(
+        measured = in_prior_pixels(
             keypoints, confidence, mask, covariance, picked, self.prior, self.camera,
             self.measurement_cov,
         )  # fmt: skip
+        if absent is None:
+            return measured
+        check_shape("absent", absent, list(keypoints.shape[:3]))
+        places = [picked.indices[row] for row in HANDS]
+        hands = absent[:, :, [max(place, 0) for place in places]].to(measured.uv)
+        unknown = torch.tensor([place < 0 for place in places], device=hands.device)
+        hands = hands.masked_fill(unknown, torch.nan)
+        return measured._replace(absence=absence_of(hands, self.camera, self.prior.info.matrix))
 
     def _screen(self, picked: Picked) -> ScreenModel | None:
         """Return the model of the outlier screening; None if keypoints are taken as they are."""

@@ -11,15 +11,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import derived
-from torchpose.camera._virtual_camera import memory_frames
+from torchpose.camera._virtual_camera import memory_frames, planes_in_view
 from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
 from torchpose.filters._memoryless import frame_evidence
 from torchpose.filters._outputs import FilterOutput
+from torchpose.filters._outside_points import OutsidePoint, with_outside_point
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
+from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._estimator import (
     ARMS,
     ArmGenerators,
@@ -127,7 +129,7 @@ class WindowMixture(Estimator):
         frames = _append(state.recent, measured)
         seen = self._see(frames, None, -measured.uv.shape[1])
         seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
-        estimates = self._estimate(seen, state.joints, None, progress)
+        estimates = self._estimate(seen, state.joints, None, progress, measured.absence)
         return WindowState(_last(frames, self._n_recent), state.joints), estimates
 
     def forward(
@@ -142,7 +144,8 @@ class WindowMixture(Estimator):
         if self.model.smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
         seen = self._see(measured, lengths, 0)
-        return repeat_last(self._estimate(seen, joints, lengths, progress), lengths)
+        found = self._estimate(seen, joints, lengths, progress, measured.absence)
+        return repeat_last(found, lengths)
 
     def _see(self, measured: MeasuredJoints, lengths: Tensor | None, start: int) -> SeenInView:
         model = self.model
@@ -156,6 +159,7 @@ class WindowMixture(Estimator):
         joints: ArmJoints,
         lengths: Tensor | None = None,
         progress: bool = False,
+        absence: Absence | None = None,
     ) -> Estimates:
         """Return the estimates of frames; their evidence is that of each frame given its window."""
         arms = {}
@@ -163,6 +167,10 @@ class WindowMixture(Estimator):
             given = self._given(seen, side, joints[side])
             model = self._filter(side, joints[side])
             out = model(*given, lengths=lengths, return_cov=True, progress=progress)
+            point = None if absence is None else self._outside(seen, absence, side)
+            if point is not None:
+                frames = model.check(*given, lengths, None)
+                out = with_outside_point(model, out, frames, point)
             if self.of_limbs:
                 torso = tuple(x for x in joints[side] if x not in ARM_JOINTS[:_N_LIMB])
                 context, told = self._evidence(seen, side, torso, lengths), arm[:_N_LIMB]
@@ -170,6 +178,16 @@ class WindowMixture(Estimator):
                 context, told = self._evidence(seen, side, (), lengths), arm
             arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
         return Estimates(arms["left"], arms["right"], seen.view)
+
+    def _outside(self, seen: SeenInView, absence: Absence, side: str) -> OutsidePoint | None:
+        """Return the evidence that an arm's hand is outside of the image, if there is any in these frames."""
+        known = seen.measured.mask[:, :, ARMS[side][0]]
+        log_inside = absence.log_inside[..., list(ARMS).index(side)].masked_fill(known, 0.0)
+        if not bool((log_inside < 0).any()):
+            return None
+        matrix = self.model.prior.info.matrix.to(absence.planes)
+        planes = planes_in_view(absence.planes, seen.view, matrix)
+        return OutsidePoint(torch.arange(2, device=planes.device), planes, log_inside)
 
     def _evidence(
         self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None

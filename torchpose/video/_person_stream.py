@@ -23,6 +23,7 @@ __all__ = [
     "PersonStream",
     "PersonStreamState",
     "TrackedBlock",
+    "absent_for",
     "measured_of",
     "unmeasured",
     "without_long_gaps",
@@ -38,12 +39,14 @@ class Measured(NamedTuple):
         size: the size of the face, by a detector about the width of the shoulders, pixels, NaN where there
             is none [T].
         confidence: 0 to 1 [T, J], 0 where missing, by a detector of keypoints; else None.
+        absent: the probability that a joint cannot be seen, NaN where nothing is known [T, J].
     """
 
     keypoints: Float[Tensor, "T J 2"]
     covariance: Float[Tensor, "T J 2 2"] | None
     size: Float[Tensor, " T"]
-    confidence: Float[Tensor, "T J"] | None = None
+    confidence: Float[Tensor, "T J"] | None
+    absent: Float[Tensor, "T J"]
 
     @property
     def seen(self) -> Bool[Tensor, " T"]:
@@ -63,7 +66,7 @@ def measured_of(
     found = unmeasured(len(block), n_joints, detected)
     for t, frame in enumerate(block):
         for row in torch.nonzero(frame.person == number).flatten()[:1]:
-            found.keypoints[t] = frame.keypoints[row]
+            found.keypoints[t], found.absent[t] = frame.keypoints[row], frame.absent[row]
             if isinstance(frame, FrameKeypoints):
                 _given(found.confidence)[t], found.size[t] = frame.confidence[row], frame.sizes[row]
             else:
@@ -81,10 +84,11 @@ def unmeasured(n_frames: int, n_joints: int, detected: bool = False) -> Measured
     """
     points = torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64)
     size = torch.full((n_frames,), torch.nan, dtype=torch.float64)
+    unknown = torch.full_like(points[..., 0], torch.nan)
     if detected:
-        return Measured(points, None, size, torch.zeros(n_frames, n_joints, dtype=torch.float64))
+        return Measured(points, None, size, torch.zeros_like(unknown), unknown)
     eye = torch.eye(2, dtype=torch.float64)
-    return Measured(points, eye.repeat(n_frames, n_joints, 1, 1), size)
+    return Measured(points, eye.repeat(n_frames, n_joints, 1, 1), size, None, unknown)
 
 
 def _given(values: Tensor | None) -> Tensor:
@@ -176,19 +180,20 @@ class PersonStream(nn.Module):
                 measured.keypoints[None],
                 _batch(measured.confidence),
                 covariance=_batch(measured.covariance),
+                absent=absent_for(self.tracker, measured.absent),
             )
             return state._replace(stream=stream), poses, measured
-        swapped = Measured(
-            measured.keypoints[:, self.exchanged],
-            _given(measured.covariance)[:, self.exchanged],
-            measured.size,
-        )
-        pairs = zip(measured[:2], swapped[:2], strict=True)
-        both = [torch.stack([_given(one), _given(other)]) for one, other in pairs]
-        stream, poses = self.tracker.advance(state.stream, both[0], covariance=both[1])
+        given = (measured.keypoints, _given(measured.covariance), measured.absent)
+        both = [torch.stack([one, one[:, self.exchanged]]) for one in given]
+        stream, poses = self.tracker.advance(
+            state.stream, both[0], covariance=both[1],
+            absent=both[2] if self.tracker.camera.image_size else None,
+        )  # fmt: skip
         votes, which = _vote(self.association, state.votes, poses, measured, images, self.hands)
-        keypoints, cov = (hypotheses[which, torch.arange(len(which))] for hypotheses in both)
-        chosen = Measured(keypoints, cov, measured.size)
+        keypoints, cov, absent = (
+            hypotheses[which, torch.arange(len(which))] for hypotheses in both
+        )
+        chosen = Measured(keypoints, cov, measured.size, None, absent)
         return PersonStreamState(stream, votes), _choose(poses, which), chosen
 
     def advance_all(
@@ -251,6 +256,13 @@ class PersonStream(nn.Module):
             parts.append(TrackedBlock(start, poses, chosen))
             start += len(chosen.seen)
         return state, parts
+
+
+def absent_for(
+    tracker: UpperBodyTracker, absent: Float[Tensor, "T J"]
+) -> Float[Tensor, "1 T J"] | None:
+    """Return the probabilities as a batch of one for a tracker; None if it does not know the image's size."""
+    return None if tracker.camera.image_size is None else absent[None]
 
 
 def _batch(values: Tensor | None) -> Tensor | None:

@@ -25,6 +25,7 @@ from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 from torchpose.video._person_stream import (
     Measured,
     TrackedBlock,
+    absent_for,
     unmeasured,
     without_long_gaps,
 )
@@ -125,6 +126,8 @@ class TrackedPerson:
             `names`.
         covariance: [T, J, 2, 2], the covariances of the keypoints, pixels squared; None with a detector.
         confidence: [T, J], the confidences of a detector, 0 to 1; None without one.
+        absent: [T, J], the probability that a joint cannot be seen, hidden or outside of the image; NaN
+            where nothing is known. None is nowhere.
     """
 
     number: int
@@ -133,6 +136,7 @@ class TrackedPerson:
     keypoints: Tensor
     covariance: Tensor | None
     confidence: Tensor | None = None
+    absent: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -223,7 +227,7 @@ class TrackedRecording:
         track = replace(track, first_frame=person.first_frame)
         found = TrackedPerson(
             person.number, person.first_frame, track, measured.keypoints, measured.covariance,
-            measured.confidence,
+            measured.confidence, measured.absent,
         )  # fmt: skip
         if smoother is None:
             return found
@@ -245,7 +249,8 @@ def smoothed(
             None if values is None else values[None]
             for values in (person.confidence, person.covariance)
         )
-        track = smoother(person.keypoints[None], confidence, names, covariance=cov)
+        absent = None if person.absent is None else absent_for(smoother, person.absent)
+        track = smoother(person.keypoints[None], confidence, names, covariance=cov, absent=absent)
     seen = person.keypoints.isfinite().flatten(1).any(1)
     track = without_long_gaps(track, seen, 0, gap)
     return replace(track, first_frame=person.first_frame)
