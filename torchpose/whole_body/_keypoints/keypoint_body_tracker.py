@@ -101,13 +101,13 @@ class KeypointBodyTracker(nn.Module):
             raise ShapeError(
                 f"keypoints must have shape [T, C, J, 2] or [B, T, C, J, 2], got {list(keypoints.shape)}"
             )
-        frames = self._frames(keypoints, confidence, names, covariance)
+        frames = self.frames(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
         if single:
             frames = KeypointFrame(*(value[None] for value in frames))
         self._check_seen(frames)
         poses = self.tracker(frames, smoothing == "full", progress)
-        tracks = [self._track(poses, frames, b) for b in range(len(frames.pixels))]
+        tracks = [self.track(poses, frames, b) for b in range(len(frames.pixels))]
         return tracks[0] if single else tracks
 
     @torch.no_grad()
@@ -122,16 +122,16 @@ class KeypointBodyTracker(nn.Module):
     ) -> tuple[KeypointStream, BodyTrack]:
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
-        frame = self._frames(keypoints, confidence, names, covariance)
+        frame = self.frames(keypoints, confidence, names, covariance)
         frame = KeypointFrame(*(value[None] for value in frame))
         stream, pose, _ = self.tracker.advance(stream, frame)
         poses = _with_time(pose)
         frames = KeypointFrame(*(value[:, None] for value in frame))
-        return stream, self._track(poses, frames, 0, summed_up=False)
+        return stream, self.track(poses, frames, 0, summed_up=False)
 
     # --- keypoints --------------------------------------------------------------------------------
 
-    def _frames(
+    def frames(
         self,
         keypoints: Tensor,
         confidence: Tensor | None,
@@ -193,7 +193,7 @@ class KeypointBodyTracker(nn.Module):
 
     # --- poses ------------------------------------------------------------------------------------
 
-    def _track(
+    def track(
         self, poses: KeypointPoses, frames: KeypointFrame, b: int, summed_up: bool = True
     ) -> BodyTrack:
         """Return the track of one element of the batch."""

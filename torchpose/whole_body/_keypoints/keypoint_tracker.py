@@ -21,7 +21,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
-__all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
+__all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
 
 _LEAST_JOINTS = 6  # that are measured where tracking begins
 _HYPOTHESES = 16  # that are tracked from one camera, which does not see the depth of limbs
@@ -108,13 +108,20 @@ class KeypointTracker(nn.Module):
                 corrected.append(found)
                 other = pose.started if before is None else stream.best != before.best
                 joined.append(pose.started | other)
-        filtered = _stacked(poses)
-        return self._smoothed(filtered, corrected, torch.stack(joined)) if smoothing else filtered
+        filtered = stacked(poses)
+        return self.smoothed(filtered, corrected, torch.stack(joined)) if smoothing else filtered
 
     def advance(
-        self, stream: KeypointStream | None, frame: KeypointFrame
+        self,
+        stream: KeypointStream | None,
+        frame: KeypointFrame,
+        predicted: BodyGaussian | None = None,
     ) -> tuple[KeypointStream, KeypointPoses, CorrectedBody]:
         """Track one more frame; the first one begins where there is no stream yet.
+
+        Args:
+            stream: of the frame before. frame: the keypoints. predicted: the states of the stream one frame
+                later, if they are known already.
 
         Returns:
             The next stream, the poses of the frame [B, ...], and the corrected likeliest hypotheses.
@@ -126,7 +133,7 @@ class KeypointTracker(nn.Module):
             stream, found = self._started(frame)
             stream = stream._replace(begun=enough)
         else:
-            stream, found = self._followed(stream, frame)
+            stream, found = self._followed(stream, frame, predicted)
             due = enough & (~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps))
             if bool(due.any()):
                 stream, found = self._begun_anew(stream, found, frame, due)
@@ -144,11 +151,12 @@ class KeypointTracker(nn.Module):
     # --- one frame --------------------------------------------------------------------------------
 
     def _followed(
-        self, stream: KeypointStream, frame: KeypointFrame
+        self, stream: KeypointStream, frame: KeypointFrame, predicted: BodyGaussian | None = None
     ) -> tuple[KeypointStream, CorrectedBody]:
         count, n_each = stream.log_weights.shape
         every = torch.arange(count, device=frame.pixels.device).repeat_interleave(n_each)
-        found = self.filter.correct(self.filter.predict(stream.state), frame.take(every))
+        predicted = self.filter.predict(stream.state) if predicted is None else predicted
+        found = self.filter.correct(predicted, frame.take(every))
         weights = stream.log_weights + found.log_evidence.view(count, n_each)
         weights = weights - weights.amax(-1, keepdim=True)
         stream = stream._replace(state=found.state, log_weights=weights)
@@ -206,7 +214,7 @@ class KeypointTracker(nn.Module):
 
     # --- whole sequences --------------------------------------------------------------------------
 
-    def _smoothed(
+    def smoothed(
         self,
         filtered: KeypointPoses,
         corrected: Sequence[CorrectedBody],
@@ -223,9 +231,9 @@ class KeypointTracker(nn.Module):
         return filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
 
 
-def _stacked(poses: Sequence[Any]) -> Any:
+def stacked(poses: Sequence[Any]) -> Any:
     """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
     first = poses[0]
     if isinstance(first, Tensor):
         return torch.stack(list(poses), 1)
-    return type(first)(*(_stacked(values) for values in zip(*poses, strict=True)))
+    return type(first)(*(stacked(values) for values in zip(*poses, strict=True)))
