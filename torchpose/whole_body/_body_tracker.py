@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any, NamedTuple, Unpack, overload
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -43,6 +43,8 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KeypointBodyTracker,
 )
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
+from torchpose.whole_body._keypoints.people_body_tracker import PeopleBodyTracker
+from torchpose.whole_body._keypoints.people_tracker import PeopleStream
 
 __all__ = ["BodyStream", "BodyTracker"]
 
@@ -58,7 +60,7 @@ class BodyStream(NamedTuple):
         generator: of random numbers.
     """
 
-    filter: BodyFilterState | KeypointStream | None
+    filter: BodyFilterState | KeypointStream | PeopleStream | None
     frame: int
     generator: torch.Generator | None
 
@@ -258,6 +260,7 @@ class BodyTracker(nn.Module):
         confidence: Float[Tensor, "*B T C J"] | None = None,
         names: Sequence[str] | None = None,
         covariance: Float[Tensor, "*B T C J"] | None = None,
+        persons: str | int | None = None,
         smoothing: str = "none",
         refine: str = "none",
         generator: torch.Generator | None = None,
@@ -270,10 +273,13 @@ class BodyTracker(nn.Module):
 
         Args:
             keypoints: [T, C, J, 2] or [B, T, C, J, 2], pixels as detected, NaN where there is none; for
-                "kalman", which takes these six arguments and `progress`.
+                "kalman", which takes these seven arguments and `progress`. With `persons`
+                [T, C, D, J, 2], of D detections in each camera, in any order, NaN where there are fewer.
             confidence: [..., C, J], from 0 (no keypoint) to 1; all 1 by default.
             names: of the J joints, of any known set; those of `BODY_15` by default.
             covariance: [..., C, J], variance along u and v, pixels squared, in place of the usual noise.
+            persons: "all" tracks everybody, a number so many persons at most at a time. Which detection is
+                whose is decided, and ``details["detection"]`` [T, C] tells it, -1 where a camera has none.
             smoothing: "full" lets later frames count too; "none" filters.
             refine: "delays", "extrinsics" or "both" of the cameras are estimated first; of one recording in
                 two cameras or more. `details` then hold `camera_delays` [T, C], the frames by which cameras
@@ -290,7 +296,9 @@ class BodyTracker(nn.Module):
             n_frames: the expected number of frames, for the bar. progress: whether to show one.
 
         Returns:
-            `BodyTrack`, from frame `first_frame`; of keypoints [B, T, ...] a list of B.
+            `BodyTrack`, from frame `first_frame`; of keypoints [B, T, ...] a list of B, and with `persons` a
+            list of all persons, whose ``details["person"]`` [T] counts them from 1 in the order in which
+            they were found.
 
         Raises:
             NobodySeenError: by all cameras in any frame, or no keypoint. InputError: silhouettes that are not
@@ -300,11 +308,21 @@ class BodyTracker(nn.Module):
         if self.by_keypoints is not None:
             if keypoints is None:
                 raise InputError(f"method {self.method} takes keypoints, got none")
+            if persons is not None and refine != "none":
+                raise InputError(
+                    f"refine={refine!r} is for recordings of one person, and persons is given; refine cameras "
+                    "on a recording of one, and take its details"
+                )
+            if persons is not None:
+                return PeopleBodyTracker(self.by_keypoints, persons).forward(
+                    keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
+                    progress=progress,
+                )  # fmt: skip
             return self.by_keypoints(
                 keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
                 refine=refine, progress=progress,
             )  # fmt: skip
-        if keypoints is not None or silhouettes is None:
+        if keypoints is not None or persons is not None or silhouettes is None:
             raise InputError(
                 f"method {self.method} takes silhouettes; keypoints need method={KEYPOINT_METHOD!r}"
             )
@@ -380,26 +398,53 @@ class BodyTracker(nn.Module):
         )
         return BodyStream(state, 0, generator)
 
+    @overload
+    def step(
+        self,
+        state: BodyStream,
+        silhouettes: Bool[Tensor, "C H W"] | None = None,
+        *,
+        keypoints: Tensor | None = None,
+        confidence: Tensor | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Tensor | None = None,
+        persons: None = None,
+    ) -> tuple[BodyStream, BodyTrack]: ...
+
+    @overload
+    def step(
+        self,
+        state: BodyStream,
+        *,
+        keypoints: Tensor | None = None,
+        confidence: Tensor | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Tensor | None = None,
+        persons: str | int,
+    ) -> tuple[BodyStream, list[BodyTrack]]: ...
+
     @torch.no_grad()
     def step(
         self,
         state: BodyStream,
         silhouettes: Bool[Tensor, "C H W"] | None = None,
         *,
-        keypoints: Float[Tensor, "C J 2"] | None = None,
-        confidence: Float[Tensor, "C J"] | None = None,
+        keypoints: Float[Tensor, "C *D J 2"] | None = None,
+        confidence: Float[Tensor, "C *D J"] | None = None,
         names: Sequence[str] | None = None,
-        covariance: Float[Tensor, "C J"] | None = None,
-    ) -> tuple[BodyStream, BodyTrack]:
+        covariance: Float[Tensor, "C *D J"] | None = None,
+        persons: str | int | None = None,
+    ) -> tuple[BodyStream, BodyTrack | list[BodyTrack]]:
         """Track one more frame: the same numbers as that frame of `forward`.
 
         Args:
             state: the state from `init` or the step before; it is not changed (but a generator goes on).
             silhouettes: the silhouettes of one frame, bool [C, H, W].
-            keypoints, confidence, names, covariance: of one frame, as in `forward`, for "kalman".
+            keypoints, confidence, names, covariance, persons: of one frame, as in `forward`, for "kalman".
 
         Returns:
-            The next state, and the `BodyTrack` of this one frame.
+            The next state, and the `BodyTrack` of this one frame. With `persons` a list of those who are
+            confirmed: a person is from the third frame on, and not earlier than a tenth of a second.
 
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
@@ -412,6 +457,11 @@ class BodyTracker(nn.Module):
             raise InputError(f"method {self.method} takes keypoints, got none")
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
+        if (isinstance(state.filter, PeopleStream) != (persons is not None)) and state.filter:
+            raise InputError("persons must be given in all steps of a stream or in none")
+        if persons is not None:
+            return self._step_people(state, keypoints, confidence, names, covariance, persons)
+        assert not isinstance(state.filter, PeopleStream)
         after, pose = self.by_keypoints.step(
             state.filter, keypoints, confidence, names, covariance=covariance
         )
@@ -441,6 +491,25 @@ class BodyTracker(nn.Module):
         poses.fps, poses.method = self.fps, self.method
         poses.notes = (*self.notes, *poses.notes)
         return BodyStream(after, state.frame + len(poses), state.generator), poses
+
+    def _step_people(
+        self,
+        state: BodyStream,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        names: Sequence[str] | None,
+        covariance: Tensor | None,
+        persons: str | int,
+    ) -> tuple[BodyStream, list[BodyTrack]]:
+        """Track the persons of one more frame."""
+        assert self.by_keypoints is not None  # or there is no state without particles
+        before = state.filter if isinstance(state.filter, PeopleStream) else None
+        after, poses = PeopleBodyTracker(self.by_keypoints, persons).step(
+            before, keypoints, confidence, names, covariance=covariance
+        )
+        for pose in poses:
+            pose.first_frame = state.frame
+        return BodyStream(after, state.frame + 1, None), poses
 
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"

@@ -121,7 +121,7 @@ class KeypointBodyTracker(nn.Module):
             raise ShapeError(
                 f"keypoints must have shape [T, C, J, 2] or [B, T, C, J, 2], got {list(keypoints.shape)}"
             )
-        frames = self._frames(keypoints, confidence, names, covariance)
+        frames = self.frames(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
         if single:
             frames = KeypointFrame(*(value[None] for value in frames))
@@ -129,7 +129,7 @@ class KeypointBodyTracker(nn.Module):
         if refine != "none":
             return self._refined_track(frames, refine, smoothing == "full", progress)
         poses = self.tracker(frames, smoothing == "full", progress)
-        tracks = [self._track(poses, frames, b) for b in range(len(frames.pixels))]
+        tracks = [self.track(poses, frames, b) for b in range(len(frames.pixels))]
         return tracks[0] if single else tracks
 
     @torch.no_grad()
@@ -144,12 +144,12 @@ class KeypointBodyTracker(nn.Module):
     ) -> tuple[KeypointStream, BodyTrack]:
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
-        frame = self._frames(keypoints, confidence, names, covariance)
+        frame = self.frames(keypoints, confidence, names, covariance)
         frame = KeypointFrame(*(value[None] for value in frame))
         stream, pose, _ = self.tracker.advance(stream, frame)
         poses = _with_time(pose)
         frames = KeypointFrame(*(value[:, None] for value in frame))
-        return stream, self._track(poses, frames, 0, summed_up=False)
+        return stream, self.track(poses, frames, 0, summed_up=False)
 
     # --- cameras ----------------------------------------------------------------------------------
 
@@ -183,14 +183,14 @@ class KeypointBodyTracker(nn.Module):
             self.rig, single, track, self.fps, refine, former.exchange, smoothing
         )
         moved = KeypointFrame(*(value[None] for value in found.frames))
-        result = self._track(found.poses, moved, 0, refined=found)
+        result = self.track(found.poses, moved, 0, refined=found)
         notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})
 
     # --- keypoints --------------------------------------------------------------------------------
 
-    def _frames(
+    def frames(
         self,
         keypoints: Tensor,
         confidence: Tensor | None,
@@ -252,7 +252,7 @@ class KeypointBodyTracker(nn.Module):
 
     # --- poses ------------------------------------------------------------------------------------
 
-    def _track(
+    def track(
         self,
         poses: KeypointPoses,
         frames: KeypointFrame,

@@ -18,12 +18,12 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
-from torchpose.whole_body._keypoints.depth_flips import flip, limb_flips
+from torchpose.whole_body._keypoints.depth_flips import flip
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
-__all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
+__all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
 
 _LEAST_JOINTS = 6  # that are measured where tracking begins
 _HYPOTHESES = 16  # that are tracked from one camera, which does not see the depth of limbs
@@ -42,14 +42,14 @@ class KeypointStream(NamedTuple):
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
         begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
-            been of something else. age: number of frames so far.
+            been of something else. age: [B], frames since tracking began.
     """
 
     state: BodyGaussian
     log_weights: Tensor
     begun: Tensor
     lost: Tensor
-    age: int
+    age: Tensor
 
 
 class KeypointPoses(NamedTuple):
@@ -99,7 +99,6 @@ class KeypointTracker(nn.Module):
             upright = camera_up(rig)
         self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
         self.n_hypotheses = _HYPOTHESES if len(rig) == 1 else 1
-        self._flips = limb_flips(motion.articulation.skeleton)
 
     def forward(
         self, frames: KeypointFrame, smoothing: bool = False, progress: bool = False
@@ -118,13 +117,20 @@ class KeypointTracker(nn.Module):
             poses.append(pose)
             if smoothing:
                 corrected.append(found)
-        filtered = _stacked(poses)
-        return self._smoothed(filtered, corrected) if smoothing else filtered
+        filtered = stacked(poses)
+        return self.smoothed(filtered, corrected) if smoothing else filtered
 
     def advance(
-        self, stream: KeypointStream | None, frame: KeypointFrame
+        self,
+        stream: KeypointStream | None,
+        frame: KeypointFrame,
+        predicted: BodyGaussian | None = None,
     ) -> tuple[KeypointStream, KeypointPoses, CorrectedBody]:
         """Track one more frame; the first one begins where there is no stream yet.
+
+        Args:
+            stream: of the frame before. frame: the keypoints. predicted: the states of the stream one frame
+                later, if they are known already.
 
         Returns:
             The next stream, the poses of the frame [B, ...], and the corrected hypotheses as one Gaussian.
@@ -136,7 +142,7 @@ class KeypointTracker(nn.Module):
             stream, found = self._started(frame)
             stream = stream._replace(begun=enough)
         else:
-            stream, found = self._followed(stream, frame)
+            stream, found = self._followed(stream, frame, predicted)
             due = enough & (~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps))
             if bool(due.any()):
                 stream, found = self._begun_anew(stream, found, frame, due)
@@ -153,11 +159,12 @@ class KeypointTracker(nn.Module):
     # --- one frame --------------------------------------------------------------------------------
 
     def _followed(
-        self, stream: KeypointStream, frame: KeypointFrame
+        self, stream: KeypointStream, frame: KeypointFrame, predicted: BodyGaussian | None = None
     ) -> tuple[KeypointStream, CorrectedBody]:
         count, n_each = stream.log_weights.shape
         every = torch.arange(count, device=frame.pixels.device).repeat_interleave(n_each)
-        found = self.filter.correct(self.filter.predict(stream.state), frame.take(every))
+        predicted = self.filter.predict(stream.state) if predicted is None else predicted
+        found = self.filter.correct(predicted, frame.take(every))
         told = _SHARE * found.log_evidence.view(count, n_each)
         weights = math.exp(-1 / (_KEPT * self.filter.fps)) * stream.log_weights + told
         weights = weights - weights.amax(-1, keepdim=True)
@@ -168,21 +175,21 @@ class KeypointTracker(nn.Module):
         self, stream: KeypointStream, found: CorrectedBody
     ) -> tuple[KeypointStream, CorrectedBody]:
         """Return hypotheses of which, now and then, the unlikeliest has become another depth of a limb."""
-        turn, wait = divmod(stream.age, max(1, round(_FLIP_TIME * self.filter.fps)))
-        if wait:
+        every = max(1, round(_FLIP_TIME * self.filter.fps))
+        due = (stream.age % every == 0).nonzero().squeeze(-1)
+        if not len(due):
             return stream, found
         weights = stream.log_weights
-        best, rows = found.take(self._rows(weights.argmax(-1), weights)), weights.argmin(-1)
-        mirrored = flip(self.filter, best.state, best.joints, self._flips[turn % len(self._flips)])
-        proposed = weights.amax(-1) + mirrored.log_ratio
-        taken = (proposed > weights.amin(-1)).nonzero().squeeze(-1)
-        if not len(taken):
-            return stream, found
-        places = (taken, rows[taken])
+        likeliest, unlikeliest = weights.argmax(-1), weights.argmin(-1)
+        best = found.take(self._rows(likeliest, weights)[due])
+        mirrored = flip(self.filter, best.state, best.joints, stream.age[due] // every)
+        proposed = weights.amax(-1)[due] + mirrored.log_ratio
+        taken = (proposed > weights.amin(-1)[due]).nonzero().squeeze(-1)
         changed = best._replace(state=mirrored.state).take(taken)
         changed = changed._replace(joints=self.filter.articulation.joints(changed.state.mean))
-        found = found.put(self._rows(rows, weights)[taken], changed)
-        weights = weights.index_put(places, proposed[taken])
+        rows = due[taken]
+        found = found.put(self._rows(unlikeliest, weights)[rows], changed)
+        weights = weights.index_put((rows, unlikeliest[rows]), proposed[taken])
         return stream._replace(state=found.state, log_weights=weights), found
 
     def _started(self, frame: KeypointFrame) -> tuple[KeypointStream, CorrectedBody]:
@@ -192,7 +199,7 @@ class KeypointTracker(nn.Module):
         zero = weights.new_zeros(count)
         begun = torch.ones(count, dtype=torch.bool, device=weights.device)
         weights = _SHARE * (weights - weights[:, :1])
-        return KeypointStream(found.state, weights, begun, zero, 0), found
+        return KeypointStream(found.state, weights, begun, zero, zero.long()), found
 
     def _begun_anew(
         self,
@@ -211,7 +218,7 @@ class KeypointTracker(nn.Module):
             stream.log_weights.index_copy(0, persons, new.log_weights),
             stream.begun | due,
             torch.where(due, 0.0, stream.lost),
-            stream.age,
+            torch.where(due, 0, stream.age),
         )
         return stream, found.put(rows, new_found)
 
@@ -261,7 +268,7 @@ class KeypointTracker(nn.Module):
 
     # --- whole sequences --------------------------------------------------------------------------
 
-    def _smoothed(
+    def smoothed(
         self,
         filtered: KeypointPoses,
         corrected: Sequence[CorrectedBody],
@@ -283,9 +290,9 @@ class KeypointTracker(nn.Module):
         return joint_cov + self.lasting_std**2 * torch.eye(3).to(joint_cov)
 
 
-def _stacked(poses: Sequence[Any]) -> Any:
+def stacked(poses: Sequence[Any]) -> Any:
     """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
     first = poses[0]
     if isinstance(first, Tensor):
         return torch.stack(list(poses), 1)
-    return type(first)(*(_stacked(values) for values in zip(*poses, strict=True)))
+    return type(first)(*(stacked(values) for values in zip(*poses, strict=True)))

@@ -1,0 +1,113 @@
+"""Several persons from detections in any order: who is who, who enters and leaves, live as in one go."""
+
+import math
+
+import pytest
+import torch
+
+from tests.whole_body.keypoints.scenes import FPS, moving_body, ring
+from torchpose.errors import InputError, NobodySeenError, ShapeError
+from torchpose.whole_body import BodyTracker
+from torchpose.whole_body._keypoints.people_association import assign
+
+T = 40
+
+
+def passing(cameras, seed=0):
+    """Two persons half a metre apart as they pass: rig, joints [T, 2, 15, 3], keypoints [T, C, D, 15, 2]."""
+    along = torch.linspace(-0.8, 0.8, T, dtype=torch.float64)
+    joints = torch.stack([moving_body(T), moving_body(T, 1.8, phase=0.4)], 1)
+    joints[:, 0, :, 0] += along[:, None]
+    joints[:, 1, :, 0] -= along[:, None]
+    joints[:, 1, :, 2] += 0.45
+    rig = ring(cameras)
+    generator = torch.Generator().manual_seed(seed)
+    pixels = torch.stack([rig(joints[:, p]).pixels for p in range(2)], 2)
+    pixels = pixels + 3 * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    return rig, joints, pixels
+
+
+def shuffled(pixels, seed=1):
+    order = torch.rand(pixels.shape[:3], generator=torch.Generator().manual_seed(seed)).argsort(-1)
+    return pixels.gather(2, order[..., None, None].expand_as(pixels)), order
+
+
+def tracker(rig):
+    return BodyTracker(rig, method="kalman", fps=FPS)
+
+
+@pytest.mark.parametrize("cameras", [3, 2])
+def test_persons_who_pass_each_other_stay_who_they_are(cameras):
+    rig, joints, pixels = passing(cameras)
+    mixed, order = shuffled(pixels)
+    found = tracker(rig)(keypoints=mixed, persons="all")
+    assert [len(one) for one in found] == [T, T]
+    alone = [tracker(rig)(keypoints=pixels[:, :, p]) for p in range(2)]
+    for one in found:
+        p = int((one.joints3d - joints.movedim(1, 0)).norm(dim=-1).mean((1, 2)).argmin())
+        error = (one.joints3d - joints[:, p]).norm(dim=-1).mean()
+        assert float(error) < 1.1 * float((alone[p].joints3d - joints[:, p]).norm(dim=-1).mean())
+        used = one.details["detection"]
+        whose = order.gather(-1, used.clamp_min(0)[..., None]).squeeze(-1)
+        assert float((whose == p)[used >= 0].double().mean()) == 1.0
+
+
+def test_live_has_the_same_numbers():
+    rig, _, pixels = passing(3)
+    pixels = shuffled(pixels)[0][:8]
+    whole = tracker(rig)(keypoints=pixels, persons=2)
+    live = tracker(rig)
+    state = live.init()
+    for frame in pixels:
+        state, now = live.step(state, keypoints=frame, persons=2)
+    assert len(now) == len(whole) == 2
+    for one, last in zip(whole, now, strict=True):
+        torch.testing.assert_close(last.joints3d[0], one.joints3d[-1])
+        assert int(last.details["person"]) == int(one.details["person"][-1])
+
+
+def test_who_enters_late_and_leaves_is_tracked_while_there():
+    rig, _, pixels = passing(3)
+    pixels[:10, :, 1] = math.nan
+    pixels[30:, :, 1] = math.nan
+    pixels[:, 2, 1] = math.nan  # a camera that sees only the first
+    found = tracker(rig)(keypoints=shuffled(pixels)[0], persons="all", smoothing="full")
+    assert [(one.first_frame, len(one)) for one in found] == [(0, T), (10, 20)]
+    assert (found[1].details["detection"][:, 2] == -1).all()
+
+
+def test_a_detection_of_nobody_and_a_double_make_no_person():
+    rig, _, pixels = passing(3)
+    false = torch.full_like(pixels[:, :, :1], math.nan)
+    false[5, 0] = pixels[5, 0, :1] + 400
+    double = pixels[:, :, :1] + 2
+    found = tracker(rig)(keypoints=torch.cat([pixels, false, double], 2), persons="all")
+    assert len(found) == 2
+
+
+def test_one_camera_tracks_two_persons_beside_each_other():
+    rig, joints, pixels = passing(1)
+    apart = pixels[:15]  # before they cover each other
+    found = tracker(rig)(keypoints=shuffled(apart)[0], persons="all")
+    assert [len(one) for one in found] == [15, 15]
+    seen = torch.stack([rig(one.joints3d).pixels[-1, 0] for one in found])
+    off = (seen[:, None] - apart[-1, 0]).norm(dim=-1).mean(-1)  # of tracks from persons
+    assert float(off.amin(1).max()) < 25.0 and set(off.argmin(1).tolist()) == {0, 1}
+
+
+def test_assignment_is_the_best_of_all():
+    gains = torch.tensor([[5.0, 4.0, -1.0], [5.5, 1.0, -2.0], [-1.0, -3.0, -2.0]])[:, None]
+    assert assign(gains)[:, 0].tolist() == [1, 0, -1]
+
+
+def test_bad_input_is_refused():
+    rig, _, pixels = passing(2)
+    for persons in ("some", 0, True):
+        with pytest.raises(InputError, match="persons"):
+            tracker(rig)(keypoints=pixels, persons=persons)
+    with pytest.raises(ShapeError):
+        tracker(rig)(keypoints=pixels[:, :, 0], persons="all")
+    with pytest.raises(InputError, match="refine"):
+        tracker(rig)(keypoints=pixels, persons="all", refine="both")
+    with pytest.raises(NobodySeenError):
+        tracker(rig)(keypoints=torch.full_like(pixels, math.nan), persons="all")

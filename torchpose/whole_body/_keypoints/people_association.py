@@ -1,0 +1,215 @@
+"""Decide whose detections are whose: by the predictions of tracked persons, and across cameras.
+
+A detection d of camera c is that of person p rather than that of somebody new by the log odds
+
+    g_pcd = sum_j log p(z_cdj | x_p) - log N(z_cdj; somewhere within a body's size),
+
+with the filter's own predictive density of keypoints. In each camera the assignment of detections to persons
+that has the largest sum of log odds is taken; a person without any above 0 has none.
+"""
+
+import math
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
+from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    Beliefs,
+    KeypointFrame,
+    RigMaps,
+    Seen,
+    see,
+    weigh,
+)
+
+__all__ = ["assign", "detection_gains", "group_detections", "taken_detections"]
+
+LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
+_BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
+_AGREE = 0.5  # share of the joints of two detections that must be triangulated
+_WIDER = 2.0  # factor of the noise's variance, of a point that two cameras give
+_BONE_STD = 0.25  # of a bone's length, relative
+_FARTHEST_BONE = 4.0  # standard deviations, at which the penalty of a bone ends
+_HEIGHT = 1.7  # metres, of the bones expected
+
+
+def detection_gains(
+    filter: BodyKalmanFilter, predicted: BodyGaussian, frame: KeypointFrame
+) -> Float[Tensor, "P C D"]:
+    """Return the log odds of detections as those of persons against somebody new, -inf without keypoints.
+
+    Args:
+        filter: that predicted. predicted: one state for each of P persons.
+        frame: [D, C, J], of the D detections of each camera.
+    """
+    joints, jacobian = filter.articulation.linearise(predicted.mean)
+    joint_cov = (jacobian @ predicted.cov.unsqueeze(-3)) @ jacobian.mT
+    seen = see(filter.maps, joints)
+    n_persons, n_detections = len(joints), len(frame.pixels)
+    persons = torch.arange(n_persons, device=joints.device).repeat_interleave(n_detections)
+    pairs = frame.take(torch.arange(n_detections, device=joints.device).repeat(n_persons))
+    seen = Seen(*(value[persons] for value in seen))
+    beliefs = Beliefs(*(value[persons] for value in predicted.beliefs))
+    weighed = weigh(
+        pairs, seen, filter.maps, beliefs, filter.exchange, joint_cov[persons], marginal=True
+    )
+    there = pairs.inlier > 0
+    gain = (weighed.log_joint - torch.where(there, _of_another(seen), 0.0)).sum(-1)
+    gain = torch.where(there.any(-1), gain, -math.inf)
+    return gain.unflatten(0, (n_persons, n_detections)).mT
+
+
+def _of_another(seen: Seen) -> Float[Tensor, "B C J"]:
+    """Return the log density of a keypoint of somebody else who is about here."""
+    size = 0.5 * seen.by_joint.square().sum((-2, -1))
+    return -(2 * math.pi * _BODY_SIZE**2 * size).log()
+
+
+def assign(gains: Float[Tensor, "P C D"]) -> Int[Tensor, "P C"]:
+    """Return the detection of every person in every camera, -1 if none, of the largest sum of gains.
+
+    Where no two persons want the same detection, each has the best; else the Hungarian method decides.
+    """
+    best, wanted = gains.max(-1)
+    wanted = torch.where(best > 0, wanted, -1)
+    clash = (wanted[:, None] == wanted) & (wanted[:, None] >= 0)
+    clash = clash.sum(0) > 1
+    for camera in clash.any(0).nonzero().flatten().tolist():
+        values = gains[:, camera].clamp_min(0).nan_to_num(0.0).cpu().numpy()
+        chosen = torch.from_numpy(_hungarian(values)).to(wanted)
+        gained = gains[:, camera].gather(-1, chosen.clamp_min(0)[:, None]).squeeze(-1)
+        wanted[:, camera] = torch.where((chosen >= 0) & (gained > 0), chosen, -1)
+    return wanted
+
+
+def _hungarian(values: np.ndarray) -> np.ndarray:
+    """Return the column of each row [P], -1 if none, with the largest sum of values that are not negative.
+
+    Shortest augmenting paths with dual prices; rows have columns of their own, of value 0.
+
+    Reference: R. Jonker and A. Volgenant (1987), "A shortest augmenting path algorithm for dense and sparse
+    linear assignment problems", https://doi.org/10.1007/BF02278710.
+    """
+    n_rows, n_columns = values.shape
+    cost = np.hstack([-values, np.zeros((n_rows, n_rows))])
+    row_price, price = np.zeros(n_rows), np.zeros(cost.shape[1])
+    owner = np.full(cost.shape[1], -1)
+    for first in range(n_rows):
+        distance, before = np.full(cost.shape[1], np.inf), np.full(cost.shape[1], -1)
+        done = np.zeros(cost.shape[1], dtype=bool)
+        row, column, reached = first, -1, 0.0
+        while row >= 0:
+            length = reached + cost[row] - row_price[row] - price
+            shorter = ~done & (length < distance)
+            distance[shorter], before[shorter] = length[shorter], column
+            column = int(np.where(done, np.inf, distance).argmin())
+            reached, row = distance[column], owner[column]
+            done[column] = True
+        inside = done & (owner >= 0)
+        row_price[first] += reached
+        row_price[owner[inside]] += reached - distance[inside]
+        price[done] -= reached - distance[done]
+        while column >= 0:
+            earlier = before[column]
+            owner[column] = first if earlier < 0 else owner[earlier]
+            column = earlier
+    found = np.full(n_rows, -1)
+    real = (owner >= 0) & (np.arange(len(owner)) < n_columns)
+    found[owner[real]] = np.nonzero(real)[0]
+    return found
+
+
+def taken_detections(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> KeypointFrame:
+    """Return the keypoints [P, C, J] of the detections of persons, none where it is -1."""
+    cameras = torch.arange(chosen.shape[1], device=chosen.device)
+    values = KeypointFrame(*(value[chosen.clamp_min(0), cameras] for value in frame))
+    return values._replace(inlier=torch.where((chosen >= 0)[..., None], values.inlier, 0.0))
+
+
+# --- new persons ----------------------------------------------------------------------------------
+
+
+def group_detections(
+    maps: RigMaps, frame: KeypointFrame, free: Bool[Tensor, "C D"]
+) -> Int[Tensor, "G C"]:
+    """Return the detections of new persons, -1 in cameras without, the surest person first.
+
+    Every two detections of two cameras triangulate joints, in every other camera the detection that agrees
+    best joins them, and lengths of bones count. The likeliest group is taken, then the likeliest of what
+    is left. Of one camera every detection is a person.
+
+    Args:
+        maps: the cameras. frame: [D, C, J]. free: which detections are to be grouped.
+    """
+    free = free & ((frame.inlier > 0).sum(-1) >= LEAST_JOINTS).mT
+    if len(maps.shift) == 1:
+        return free[0].nonzero()
+    pairs = _pairs(free)
+    if not len(pairs):
+        return pairs
+    joints = triangulate(maps, taken_detections(frame, pairs))
+    known = joints.isfinite().all(-1)
+    gains = _agreement(maps, frame, joints).masked_fill(~free, -math.inf)
+    of_pair = gains.gather(-1, pairs.clamp_min(0)[..., None]).squeeze(-1)
+    best, joined = gains.max(-1)
+    groups = torch.where(pairs >= 0, pairs, torch.where(best > 0, joined, -1))
+    score = torch.where(pairs >= 0, of_pair, best.clamp_min(0)).sum(-1) - _bone_penalty(joints)
+    there = (taken_detections(frame, pairs).inlier > 0).sum(1) == 2
+    enough = known.sum(-1) >= (_AGREE * there.sum(-1)).clamp_min(LEAST_JOINTS)
+    enough &= ((of_pair > 0) | (pairs < 0)).all(-1)
+    return _disjoint(groups, torch.where(enough, score, -math.inf))
+
+
+def _pairs(free: Bool[Tensor, "C D"]) -> Int[Tensor, "H C"]:
+    """Return all pairs of detections of two cameras, -1 in the other cameras."""
+    found = []
+    for a, b in combinations(range(len(free)), 2):
+        both = (free[a][:, None] & free[b]).nonzero()
+        pair = both.new_full((len(both), len(free)), -1)
+        pair[:, [a, b]] = both
+        found.append(pair)
+    return torch.cat(found)
+
+
+def _agreement(
+    maps: RigMaps, frame: KeypointFrame, joints: Float[Tensor, "H J 3"]
+) -> Float[Tensor, "H C D"]:
+    """Return the log odds of detections as those of triangulated joints against somebody else."""
+    known = joints.isfinite().all(-1)
+    seen = see(maps, joints.nan_to_num())
+    size = 0.5 * seen.by_joint.square().sum((-2, -1))[:, None]  # [H, 1, C, J]
+    variance = _WIDER * (frame.variance + frame.relative * size)
+    square = (frame.pixels - seen.pixels[:, None]).square().sum(-1)
+    log_in = -0.5 * square / variance - (2 * math.pi * variance).log()
+    outside = torch.log1p(-frame.inlier) - maps.log_area[:, None]
+    both = torch.logaddexp(frame.inlier.clamp_min(1e-30).log() + log_in, outside)
+    there = (frame.inlier > 0) & (known[:, None] & seen.in_front)[:, None]
+    gains = torch.where(there, both - _of_another(seen)[:, None], 0.0)
+    return gains.sum(-1).mT
+
+
+def _bone_penalty(joints: Float[Tensor, "H J 3"]) -> Float[Tensor, " H"]:
+    """Return half the squared deviations of bones from usual lengths, up to a farthest one."""
+    parents = torch.tensor([max(parent, 0) for parent in BODY_15.parents])
+    usual = Body.of_height(BODY_15, _HEIGHT).bone_lengths.to(joints).clamp_min(1e-3)
+    off = ((joints - joints[:, parents]).norm(dim=-1) / usual - 1) / _BONE_STD
+    off = off[:, 1:].nan_to_num(0.0).abs().clamp_max(_FARTHEST_BONE)
+    return 0.5 * off.square().sum(-1)
+
+
+def _disjoint(groups: Int[Tensor, "H C"], score: Float[Tensor, " H"]) -> Int[Tensor, "G C"]:
+    """Return groups that share no detection, the one of the largest score first."""
+    found = []
+    while bool((score > 0).any()):
+        group = groups[score.argmax()]
+        found.append(group)
+        shared = ((groups == group) & (group >= 0)).any(-1)
+        score = score.masked_fill(shared, -math.inf)
+    return torch.stack(found) if found else groups[:0]

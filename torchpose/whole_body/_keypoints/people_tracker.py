@@ -1,0 +1,256 @@
+"""Track several persons through detections of keypoints: whose are whose, who enters, who leaves."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_tracker import (
+    KeypointPoses,
+    KeypointStream,
+    KeypointTracker,
+)
+from torchpose.whole_body._keypoints.people_association import (
+    assign,
+    detection_gains,
+    group_detections,
+    taken_detections,
+)
+
+__all__ = ["PeopleFrame", "PeopleStream", "PeopleTracker", "taken"]
+
+_CONFIRM_TIME, _CONFIRM_FRAMES = 0.1, 3  # seconds, and frames at least, that confirm a person
+_TENTATIVE_TIME = 0.1  # seconds without agreeing cameras after which somebody unconfirmed is nobody
+_GONE_TIME = 1.0  # seconds without keypoints after which a person has left
+_ALONE_TIME = 0.25  # seconds with one camera, after which its keypoints may begin somebody else
+_SAME = 0.15  # metres between joints, on average, below which two persons are one
+_SAME_TIME = 0.2  # seconds of that
+_LEAST_INLIERS = 0.5  # share of the keypoints of a start that must be those of a body
+
+
+class PeopleStream(NamedTuple):
+    """Holds the state of tracking P persons between two frames.
+
+    Attributes:
+        bodies: of their filters, None if there is nobody.
+        number: [P], unlike all others before. n_begun: of numbers that were given.
+        hits: [P], frames in which cameras agreed. missed: [P], frames in a row in which they did not.
+        unseen: [P], frames in a row without keypoints. doubled: [P], frames in a row at another's place.
+        identity: [P], from 1 on in the order in which they were confirmed, 0 of those who are tentative.
+        n_confirmed: of identities that were given.
+    """
+
+    bodies: KeypointStream | None
+    number: Tensor
+    n_begun: int
+    hits: Tensor
+    missed: Tensor
+    unseen: Tensor
+    doubled: Tensor
+    identity: Tensor
+    n_confirmed: int
+
+
+class PeopleFrame(NamedTuple):
+    """Holds what a frame says of P persons.
+
+    Attributes:
+        number: [P]. identity: [P]. detection: [P, C], which detection of a camera is a person's, -1 if none.
+        keypoints: of these, [P, C, J]. poses: [P]. corrected: their hypotheses as one Gaussian.
+    """
+
+    number: Tensor
+    identity: Tensor
+    detection: Tensor
+    keypoints: KeypointFrame
+    poses: KeypointPoses
+    corrected: CorrectedBody
+
+
+class PeopleTracker:
+    """Tracks the persons of frames of detections, all in one batch.
+
+    Args:
+        tracker: of single persons. most: persons at a time, None for any number.
+    """
+
+    def __init__(self, tracker: KeypointTracker, most: int | None = None) -> None:
+        self.tracker, self.most = tracker, most
+        self.n_cameras = len(tracker.filter.maps.shift)
+        self.agreeing = min(2, self.n_cameras)
+
+    def advance(
+        self, stream: PeopleStream | None, frame: KeypointFrame
+    ) -> tuple[PeopleStream, PeopleFrame | None]:
+        """Track one more frame.
+
+        Args:
+            stream: of the frame before, None before the first. frame: [D, C, J], detections in any order.
+
+        Returns:
+            The next stream, and the persons of the frame, None if there is nobody.
+        """
+        stream = _nobody(frame) if stream is None else stream
+        there = (frame.inlier > 0).any(-1).mT  # [C, D]
+        found, free, weak = None, there, torch.zeros_like(stream.number, dtype=torch.bool)
+        if stream.bodies is not None:
+            stream, found, free, weak = self._followed(stream, frame, there)
+        stream, found = self._with_new(stream, found, frame, free, weak)
+        if found is None:
+            return stream, None
+        stream = self._counted(stream, found)
+        return self._without_gone(stream), found._replace(identity=stream.identity)
+
+    # --- persons who are there --------------------------------------------------------------------
+
+    def _followed(
+        self, stream: PeopleStream, frame: KeypointFrame, there: Bool[Tensor, "C D"]
+    ) -> tuple[PeopleStream, PeopleFrame, Bool[Tensor, "C D"], Bool[Tensor, " P"]]:
+        """Return persons one frame later, detections that begin others, and who may give theirs up."""
+        bodies = stream.bodies
+        assert bodies is not None
+        predicted = self.tracker.filter.predict(bodies.state)
+        n_persons, n_each = bodies.log_weights.shape
+        rows = torch.arange(n_persons, device=there.device) * n_each + bodies.log_weights.argmax(-1)
+        gains = detection_gains(self.tracker.filter, predicted.take(rows), frame)
+        chosen = assign(gains)
+        keypoints = taken_detections(frame, chosen)
+        after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted)
+        found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
+        weak = stream.missed > _ALONE_TIME * self.tracker.filter.fps
+        explained = (gains > 0).masked_fill(weak[:, None, None], False).any(0)
+        owned = _owned(chosen[~weak], there)
+        return stream._replace(bodies=after), found, there & ~explained & ~owned, weak
+
+    # --- persons who enter ------------------------------------------------------------------------
+
+    def _with_new(
+        self,
+        stream: PeopleStream,
+        found: PeopleFrame | None,
+        frame: KeypointFrame,
+        free: Bool[Tensor, "C D"],
+        weak: Bool[Tensor, " P"],
+    ) -> tuple[PeopleStream, PeopleFrame | None]:
+        """Return the stream and the frame with persons who begin in it.
+
+        One whom a single camera saw, and whose keypoints there agree with others that nobody explains, begins
+        anew with them and stays the same person.
+        """
+        groups = group_detections(self.tracker.filter.maps, frame, free)
+        former = torch.full_like(groups[:, 0], -1)
+        identity = torch.zeros_like(former)
+        if found is not None and len(groups):
+            owner = ((found.detection[:, None] == groups) & (groups >= 0)).any(-1) & weak[:, None]
+            row = owner.to(torch.uint8).argmax(0)
+            former = torch.where(owner.any(0), stream.number[row], -1)
+            identity = torch.where(owner.any(0), stream.identity[row], 0)
+            keep = (~owner.any(-1)).nonzero().squeeze(-1)
+            stream, found = self._kept(stream, keep), taken(found, keep)
+        room = None if self.most is None else max(self.most - len(stream.number), 0)
+        groups, former, identity = groups[:room], former[:room], identity[:room]
+        if not len(groups):
+            return stream, found if found is not None and len(found.number) else None
+        keypoints = taken_detections(frame, groups)
+        bodies, poses, corrected = self.tracker.advance(None, keypoints)
+        count = (keypoints.inlier > 0).sum((-2, -1))
+        sure = poses.inlier.sum((-2, -1)) >= _LEAST_INLIERS * count
+        number = torch.arange(len(groups), device=groups.device) + stream.n_begun
+        number = torch.where(former >= 0, former, number)
+        begun = PeopleFrame(number, identity, groups, keypoints, poses, corrected)
+        zero = poses.log_evidence.new_zeros(len(groups))
+        beginners = PeopleStream(
+            bodies, number, stream.n_begun + len(groups), zero, zero, zero, zero, identity,
+            stream.n_confirmed,
+        )  # fmt: skip
+        rows = sure.nonzero().squeeze(-1)
+        beginners, begun = self._kept(beginners, rows), taken(begun, rows)
+        if not len(rows):
+            return stream._replace(n_begun=beginners.n_begun), found
+        if stream.bodies is None or found is None:
+            return beginners, begun
+        return _joined(stream, beginners), _joined(found, begun)
+
+    # --- who is confirmed, who has left -----------------------------------------------------------
+
+    def _counted(self, stream: PeopleStream, found: PeopleFrame) -> PeopleStream:
+        """Return the stream with the frame counted."""
+        fps = self.tracker.filter.fps
+        n_seen = (found.detection >= 0).sum(-1)
+        agreed = n_seen >= self.agreeing
+        hits = stream.hits + agreed.to(stream.hits)
+        doubled = _doubled(found.poses.joints)
+        new = (
+            (stream.identity == 0) & ~doubled & (hits >= max(_CONFIRM_FRAMES, _CONFIRM_TIME * fps))
+        )
+        identity = torch.where(new, stream.n_confirmed + new.cumsum(0), stream.identity)
+        return stream._replace(
+            hits=hits,
+            missed=torch.where(agreed, 0.0, stream.missed + 1),
+            unseen=torch.where(n_seen > 0, 0.0, stream.unseen + 1),
+            doubled=torch.where(doubled, stream.doubled + 1, 0.0),
+            identity=identity,
+            n_confirmed=stream.n_confirmed + int(new.sum()),
+        )
+
+    def _without_gone(self, stream: PeopleStream) -> PeopleStream:
+        """Return the stream without those who left, were never confirmed, or are somebody else."""
+        fps = self.tracker.filter.fps
+        gone = stream.unseen > _GONE_TIME * fps
+        gone |= (stream.identity == 0) & (stream.missed > _TENTATIVE_TIME * fps)
+        gone |= stream.doubled > _SAME_TIME * fps
+        return self._kept(stream, (~gone).nonzero().squeeze(-1))
+
+    def _kept(self, stream: PeopleStream, rows: Int[Tensor, " n"]) -> PeopleStream:
+        """Return the stream with some persons alone."""
+        if stream.bodies is None or len(rows) == len(stream.number):
+            return stream
+        bodies = stream.bodies
+        n_each = bodies.log_weights.shape[1]
+        every = (rows[:, None] * n_each + torch.arange(n_each, device=rows.device)).flatten()
+        state: BodyGaussian = bodies.state.take(every)
+        rest = KeypointStream(state, *(taken(value, rows) for value in bodies[1:]))
+        other: dict[str, Any] = {
+            name: value[rows]
+            for name, value in stream._asdict().items()
+            if isinstance(value, Tensor)
+        }
+        return stream._replace(bodies=rest if len(rows) else None, **other)
+
+
+def _nobody(frame: KeypointFrame) -> PeopleStream:
+    none = frame.inlier.new_zeros(0)
+    return PeopleStream(None, none.long(), 0, none, none, none, none, none.long(), 0)
+
+
+def _owned(chosen: Int[Tensor, "P C"], there: Bool[Tensor, "C D"]) -> Bool[Tensor, "C D"]:
+    """Return which detections are somebody's."""
+    places = torch.arange(there.shape[1], device=there.device)
+    return (chosen[..., None] == places).any(0)
+
+
+def _doubled(joints: Float[Tensor, "P J 3"]) -> Bool[Tensor, " P"]:
+    """Return who is at the place of somebody who began before."""
+    apart = (joints[:, None] - joints).norm(dim=-1).mean(-1)
+    earlier = torch.ones_like(apart).tril(-1) > 0
+    return (torch.where(earlier, apart, math.inf) < _SAME).any(-1)
+
+
+def taken(value: Any, rows: Tensor) -> Any:
+    """Return some persons of a tensor, or of named tuples of tensors."""
+    if isinstance(value, Tensor):
+        return value[rows]
+    return type(value)(*(taken(part, rows) for part in value))
+
+
+def _joined(first: Any, second: Any) -> Any:
+    """Return the persons of two tensors, or of named tuples of tensors, in one; numbers are the second's."""
+    if isinstance(first, Tensor):
+        return torch.cat([first, second])
+    if isinstance(first, int):
+        return second
+    return type(first)(*(_joined(a, b) for a, b in zip(first, second, strict=True)))
