@@ -310,8 +310,8 @@ class BodyTracker(nn.Module):
                 raise InputError(f"method {self.method} takes keypoints, got none")
             if persons is not None and refine != "none":
                 raise InputError(
-                    f"refine={refine!r} is for recordings of one person, and persons is given; refine cameras "
-                    "on a recording of one, and take its details"
+                    f"refine={refine!r} is for recordings of one person, and persons is given; refine "
+                    "cameras on a recording of one, and take its details"
                 )
             if persons is not None:
                 return PeopleBodyTracker(self.by_keypoints, persons).forward(

@@ -86,7 +86,7 @@ def test_a_detection_of_nobody_and_a_double_make_no_person():
 
 
 def test_one_camera_tracks_two_persons_beside_each_other():
-    rig, joints, pixels = passing(1)
+    rig, _, pixels = passing(1)
     apart = pixels[:15]  # before they cover each other
     found = tracker(rig)(keypoints=shuffled(apart)[0], persons="all")
     assert [len(one) for one in found] == [15, 15]
