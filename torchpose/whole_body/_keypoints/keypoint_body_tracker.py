@@ -129,6 +129,16 @@ class KeypointBodyTracker(nn.Module):
         frames = KeypointFrame(*(value[:, None] for value in frame))
         return stream, self._track(poses, frames, 0, summed_up=False)
 
+    def frames_of(
+        self,
+        keypoints: Float[Tensor, "*batch C J 2"],
+        confidence: Float[Tensor, "*batch C J"] | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Float[Tensor, "*batch C J"] | None = None,
+    ) -> KeypointFrame:
+        """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
+        return self._frames(keypoints, confidence, names, covariance)
+
     # --- keypoints --------------------------------------------------------------------------------
 
     def _frames(
