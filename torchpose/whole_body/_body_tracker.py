@@ -44,7 +44,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 from torchpose.whole_body._measured_keypoints import (
     GivenKeypoints,
-    KeypointMeasurer,
+    BodyKeypointMeasurer,
     given_keypoints,
     observed_frames,
 )
@@ -75,9 +75,9 @@ class BodyTracker(nn.Module):
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
 
-    Every method takes the keypoints of any detector. ``kalman`` takes them in one camera or more. It is an iterated extended Kalman
-    filter over root, rotations, their velocities and bone lengths, in which every keypoint is its joint's,
-    that of the other side, or nobody's (docs/keypoint-bodies.md). The other methods are
+    Every method takes the keypoints of any detector, in one camera or more. ``kalman`` is an iterated
+    extended Kalman filter over root, rotations, their velocities and bone lengths, in which every keypoint
+    is its joint's, that of the other side, or nobody's (docs/keypoint-bodies.md). The other methods are
     particle filters, and take silhouettes, keypoints, or both, whose log-likelihoods add:
 
     - ``mrpf``: also weighted by the distance from a manifold of poses of the same action
@@ -209,7 +209,7 @@ class BodyTracker(nn.Module):
         )
         self.register_buffer("_initial_std", std, persistent=std is not None)
         self._keypoint_noise = keypoint_std, pixel_std
-        self._measurer: KeypointMeasurer | None = None
+        self._measurer: BodyKeypointMeasurer | None = None
 
     _initial_std: Tensor | None
 
@@ -286,7 +286,7 @@ class BodyTracker(nn.Module):
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
-            if keypoints is None or silhouettes is not None:
+            if silhouettes is not None or keypoints is None:
                 raise InputError(
                     f"method {self.method} takes keypoints and no silhouettes, got "
                     f"{'silhouettes' if keypoints is None else 'both'}; other methods take either or both"
@@ -458,10 +458,10 @@ class BodyTracker(nn.Module):
         return observed_frames(silhouettes, self._keypoint_measurer, measured), measured
 
     @property
-    def _keypoint_measurer(self) -> KeypointMeasurer:
+    def _keypoint_measurer(self) -> BodyKeypointMeasurer:
         """Return what makes measurements of keypoints; it is set up by the first ones."""
         if self._measurer is None:
-            self._measurer = KeypointMeasurer(
+            self._measurer = BodyKeypointMeasurer(
                 self.cameras, self.fps, self.upright, *self._keypoint_noise
             )
         return self._measurer

@@ -17,7 +17,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS
 from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 
-__all__ = ["GivenKeypoints", "KeypointMeasurer", "given_keypoints", "observed_frames"]
+__all__ = ["GivenKeypoints", "BodyKeypointMeasurer", "given_keypoints", "observed_frames"]
 
 
 class GivenKeypoints(NamedTuple):
@@ -48,7 +48,7 @@ def given_keypoints(
     return GivenKeypoints(keypoints, confidence, names, covariance)
 
 
-class KeypointMeasurer:
+class BodyKeypointMeasurer:
     """Makes measurements for particle filters of a detector's keypoints.
 
     Args:
@@ -108,7 +108,7 @@ class KeypointMeasurer:
 
 def observed_frames(
     silhouettes: Iterable[Tensor] | None,
-    measurer: KeypointMeasurer | None,
+    measurer: BodyKeypointMeasurer | None,
     frames: KeypointFrame | None,
 ) -> Iterator[Observed]:
     """Yield frames of silhouettes, of keypoints, or of both.

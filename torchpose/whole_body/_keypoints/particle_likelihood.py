@@ -7,8 +7,8 @@ right of a group g (arms, legs) are exchanged in a camera,
     p(z_cj | x) = pi N(z_cj; h_c(p_j(x)), (r + m f^2 / depth^2) I) + (1 - pi) / a,
 
 with j' the joint on the other side. Joints in the middle are a group without exchange, and missing keypoints
-are left out. The exponent k makes up for errors of a detector that cameras, joints and frames share, and keeps
-particles alive: a few hundred cannot cover a likelihood that is as sharp as that of all keypoints.
+are left out. The exponent k makes up for errors of a detector that cameras, joints and frames share, and
+keeps particles alive: a few hundred cannot cover a likelihood that is as sharp as that of all keypoints.
 """
 
 import math
@@ -68,8 +68,8 @@ def keypoint_log_likelihood(
         measured: the keypoints of a frame. joints: metres, world axes.
 
     Returns:
-        [B, N], float64; 0 in elements without a keypoint. No keypoint, however far off, lowers it by more than
-        the density of outliers does.
+        [B, N], float64; 0 in elements without a keypoint. No keypoint, however far off, lowers it by more
+        than the density of outliers does.
     """
     frame, seen, weighed, _ = _weighed(measured, joints)
     # a joint behind a camera makes its keypoint an outlier, which `weigh` leaves out
@@ -101,9 +101,7 @@ def limbs_given_keypoints(
         mean, covariance: of the V = P - 1 parts that are not the root, quaternion vectors.
         least_std: least standard deviation in any direction.
     """
-    frame, seen, weighed, exchange = _weighed(measured, body.joints(states))
-    matrix, pull = information(frame, seen, weighed, exchange)
-    matrix, pull = matrix.view(*states.shape[:2], -1, 3, 3), pull.view(*states.shape[:2], -1, 3)
+    joints = body.joints(states)
     carried, part = _carried(body)
     points = sigma_points(mean, covariance)
     apart = 2 * math.sqrt(points.shape[-1])
@@ -113,7 +111,15 @@ def limbs_given_keypoints(
     turns = turns @ quaternion_vector_to_matrix(within_unit_ball(points))
     moved = (turns[..., :3, :, :] - turns[..., 3:, :, :])[:, :, part] / apart
     offsets = body.joint_weights[_ROOT // 2 :].unflatten(0, (-1, 3))[part, :, carried]
-    by_point = (moved @ offsets[:, None, :, None]).squeeze(-1).mT.to(matrix)  # H [B, N, J', 3, 3]
+    by_point = (
+        (moved @ offsets[:, None, :, None]).squeeze(-1).mT.to(measured.maps.shift)
+    )  # H [B, N, J', 3, 3]
+    # predicted where the part may be, a keypoint that is off by that much is no outlier
+    spread = by_point.new_zeros(*joints.shape, 3)
+    spread[:, :, carried] = by_point @ by_point.mT
+    frame, seen, weighed, exchange = _weighed(measured, joints, spread)
+    matrix, pull = information(frame, seen, weighed, exchange)
+    matrix, pull = matrix.view(spread.shape), pull.view(joints.shape)
     gained = by_point.mT @ matrix[:, :, carried] @ by_point
     pulled = (by_point.mT @ pull[:, :, carried, :, None]).squeeze(-1)
     eye = torch.eye(3).to(matrix).expand(*covariance.shape).clone()
@@ -127,7 +133,9 @@ def limbs_given_keypoints(
 
 
 def _weighed(
-    measured: KeypointMeasurement, joints: Float[Tensor, "B N J 3"]
+    measured: KeypointMeasurement,
+    joints: Float[Tensor, "B N J 3"],
+    joint_cov: Float[Tensor, "B N J 3 3"] | None = None,
 ) -> tuple[KeypointFrame, Seen, Weighed, Exchange]:
     """Return the keypoints repeated for every particle, its joints in the cameras, and their weights."""
     batch, n = joints.shape[:2]
@@ -140,7 +148,9 @@ def _weighed(
     new = maps.shift.new_full
     n_cameras = len(maps.shift)
     beliefs = Beliefs(new((batch * n, n_cameras, 2), _LOG_ODDS), new((batch * n, n_cameras), 1.0))
-    return frame, seen, weigh(frame, seen, maps, beliefs, exchange), exchange
+    spread = None if joint_cov is None else joint_cov.flatten(0, 1)
+    weighed = weigh(frame, seen, maps, beliefs, exchange, spread, marginal=spread is not None)
+    return frame, seen, weighed, exchange
 
 
 def _carried(body: Body) -> tuple[Tensor, Tensor]:
