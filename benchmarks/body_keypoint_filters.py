@@ -4,7 +4,7 @@ Bodies, cameras and silhouettes are those of the protocols Silhouette (walks in 
 uncertainty (the same walks at few frames per second) and Bend (one camera beside a person who bends); the
 walks are also tracked in one camera alone. Keypoints of the same bodies in the same cameras have the faults
 of `benchmarks.keypoint_bodies`, in images nine times as large as the silhouettes. Bone lengths are of other
-recordings of the person. It writes keypoint-filters.md.
+recordings of the person. It writes summary-keypoint-filters.md.
 
     python -m benchmarks.body_keypoint_filters --data DIR --out DIR
 """
@@ -165,7 +165,7 @@ def main(
     seed: int = 0,
     progress: bool = True,
 ) -> None:
-    """Write keypoint-filters.md.
+    """Write summary-keypoint-filters.md.
 
     Args:
         data: folder of the recordings. out: folder for the report.
@@ -218,8 +218,8 @@ def _write(
         name = method if given == "-" else f"{method}, {given}"
         table.add(name, [row.get(column) for column in COLUMNS])
     print(report.summary())
-    with atomic_path(out / "keypoint-filters.md") as path:
-        path.write_text(report.to_markdown(), encoding="utf-8")
+    with atomic_path(out / "summary-keypoint-filters.md") as path:
+        path.write_text(table.to_markdown() + "\n", encoding="utf-8")
 
 
 def _place(key: tuple[str, str]) -> tuple[int, int]:

@@ -43,8 +43,8 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 from torchpose.whole_body._measured_keypoints import (
-    GivenKeypoints,
     BodyKeypointMeasurer,
+    GivenKeypoints,
     given_keypoints,
     observed_frames,
 )
