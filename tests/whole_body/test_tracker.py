@@ -181,7 +181,7 @@ def test_a_frame_counts_if_every_camera_sees_somebody():
 def test_what_does_not_go_together_is_refused(method, options, said):
     with pytest.raises(InputError, match=said):
         BodyTracker(rig(), method, **options)
-    with pytest.raises(InputError, match="got neither"):
+    with pytest.raises(InputError, match="got none"):
         BodyTracker(rig()).init()
 
 

@@ -1,6 +1,6 @@
 """Track whole bodies: from keypoints or silhouettes in calibrated cameras to the poses of one person."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack, overload
@@ -37,19 +37,27 @@ from torchpose.whole_body._filter_table import (
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._first_pose import find_first_pose
-from torchpose.whole_body._following import all_see, follow
+from torchpose.whole_body._following import Observed, all_see, follow
 from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KEYPOINT_METHOD,
     KeypointBodyTracker,
 )
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 from torchpose.whole_body._keypoints.people_body_tracker import PeopleBodyTracker
 from torchpose.whole_body._keypoints.people_tracker import PeopleStream
+from torchpose.whole_body._measured_keypoints import (
+    BodyKeypointMeasurer,
+    GivenKeypoints,
+    given_keypoints,
+    observed_frames,
+)
 
 __all__ = ["BodyStream", "BodyTracker"]
 
 _HEIGHT = 1.75  # metres, of a person of unknown height
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
+_UNSEEN = "too few keypoints were given", "not all cameras saw somebody"
 
 
 class BodyStream(NamedTuple):
@@ -71,10 +79,10 @@ class BodyTracker(nn.Module):
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
 
-    ``kalman`` takes the keypoints of any detector in one camera or more. It is an iterated extended Kalman
-    filter over root, rotations, their velocities and bone lengths, in which every keypoint is its joint's,
-    that of the other side, or nobody's (docs/keypoint-bodies.md). The other methods take silhouettes, and are
-    particle filters:
+    Every method takes the keypoints of any detector, in one camera or more. ``kalman`` is an iterated
+    extended Kalman filter over root, rotations, their velocities and bone lengths, in which every keypoint
+    is its joint's, that of the other side, or nobody's (docs/keypoint-bodies.md). The other methods are
+    particle filters, and take silhouettes, keypoints, or both, whose log-likelihoods add:
 
     - ``mrpf``: also weighted by the distance from a manifold of poses of the same action
       (`ManifoldParticleFilter`); needs `manifold`.
@@ -105,7 +113,7 @@ class BodyTracker(nn.Module):
             default what suits the method.
         initial_cov: the variances of the particles about the first pose, as `process_cov`; by default
             four times those.
-        keypoint_std: of "kalman", how far a detector's joints are from the body's, metres along each axis;
+        keypoint_std: how far a detector's joints are from the body's, metres along each axis;
             keypoints of low confidence are farther. pixel_std: the same in pixels, on top of it.
         motion: of "kalman", how bodies move, a name that `torchpose info` lists, or a file of `torchpose
             fit body`; in Python also the `BodyMotion` itself.
@@ -183,10 +191,7 @@ class BodyTracker(nn.Module):
             )  # fmt: skip
             self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return
-        alone = {
-            "keypoint_std": keypoint_std, "pixel_std": pixel_std, "motion": motion, "up": up,
-        }  # fmt: skip
-        unused = [name for name, value in alone.items() if value is not None]
+        unused = [name for name, value in (("motion", motion), ("up", up)) if value is not None]
         if unused:
             raise InputError(
                 f"{', '.join(unused)} does nothing without method={KEYPOINT_METHOD!r}; leave it out"
@@ -219,6 +224,8 @@ class BodyTracker(nn.Module):
             else std_of_covariance("initial_cov", initial_cov, tracked.dim)
         )
         self.register_buffer("_initial_std", std, persistent=std is not None)
+        self._keypoint_noise = keypoint_std, pixel_std
+        self._measurer: BodyKeypointMeasurer | None = None
 
     _initial_std: Tensor | None
 
@@ -272,23 +279,26 @@ class BodyTracker(nn.Module):
         """Track one person from the first frame whose silhouettes all show a person, or that has keypoints.
 
         Args:
-            keypoints: [T, C, J, 2] or [B, T, C, J, 2], pixels as detected, NaN where there is none; for
-                "kalman", which takes these seven arguments and `progress`. With `persons`
-                [T, C, D, J, 2], of D detections in each camera, in any order, NaN where there are fewer.
+            keypoints: [T, C, J, 2], pixels as detected, NaN where there is none; "kalman" takes
+                [B, T, C, J, 2] as well, and of these arguments only the first seven and `progress`. With
+                `persons` [T, C, D, J, 2], of D detections in each camera, in any order, NaN where there are
+                fewer.
             confidence: [..., C, J], from 0 (no keypoint) to 1; all 1 by default.
             names: of the J joints, of any known set; those of `BODY_15` by default.
             covariance: [..., C, J], variance along u and v, pixels squared, in place of the usual noise.
-            persons: "all" tracks everybody, a number so many persons at most at a time. Which detection is
-                whose is decided, and ``details["detection"]`` [T, C] tells it, -1 where a camera has none.
-            smoothing: "full" lets later frames count too; "none" filters.
-            refine: "delays", "extrinsics" or "both" of the cameras are estimated first; of one recording in
-                two cameras or more. `details` then hold `camera_delays` [T, C], the frames by which cameras
-                began too early, `camera_rotation` (Rodrigues) and `camera_translation` [T, C, 3], and
-                `camera_errors_std` [T, C, 7] of rotation (radians), shift (metres) and delay (frames).
+            persons: of "kalman", "all" tracks everybody, a number so many persons at most at a time. Which
+                detection is whose is decided, and ``details["detection"]`` [T, C] tells it, -1 where a camera
+                has none.
+            smoothing: of "kalman", "full" lets later frames count too; "none" filters.
+            refine: of "kalman", "delays", "extrinsics" or "both" of the cameras are estimated first; of one
+                recording in two cameras or more. `details` then hold `camera_delays` [T, C], the frames by
+                which cameras began too early, `camera_rotation` (Rodrigues) and `camera_translation`
+                [T, C, 3], and `camera_errors_std` [T, C, 7] of rotation (radians), shift (metres) and delay
+                (frames).
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
-                (`find_first_pose`) if None.
+                if None, in keypoints by the Kalman smoother, else in silhouettes (`find_first_pose`).
             generator: the generator of random numbers.
             lengths: [1], the number of frames of the sequence, if they are fewer; past them the last pose
                 is repeated.
@@ -306,8 +316,13 @@ class BodyTracker(nn.Module):
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
-            if keypoints is None:
-                raise InputError(f"method {self.method} takes keypoints, got none")
+            if silhouettes is not None or keypoints is None:
+                raise InputError(
+                    f"method {self.method} takes keypoints and no silhouettes, got "
+                    f"{'silhouettes' if keypoints is None else 'both'}; other methods take either or both"
+                    if silhouettes is not None
+                    else f"method {self.method} takes keypoints, got none"
+                )
             if persons is not None and refine != "none":
                 raise InputError(
                     f"refine={refine!r} is for recordings of one person, and persons is given; refine "
@@ -322,33 +337,27 @@ class BodyTracker(nn.Module):
                 keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
                 refine=refine, progress=progress,
             )  # fmt: skip
-        if keypoints is not None or persons is not None or silhouettes is None:
-            raise InputError(
-                f"method {self.method} takes silhouettes; keypoints need method={KEYPOINT_METHOD!r}"
-            )
-        source = iter(silhouettes)
+        self._check_kind(smoothing, refine, persons)
+        source, measured = self._observed(
+            silhouettes, given_keypoints(keypoints, confidence, names, covariance)
+        )
         frames = source if lengths is None else islice(source, _whole(lengths))
-        seen = next(((t, masks) for t, masks in enumerate(frames) if all_see(masks)), None)
-        if seen is None:
-            raise NobodySeenError(
-                "nobody is seen by all cameras in any frame; check the silhouettes, or leave out the "
-                "camera that sees nobody"
-            )
-        begun, first = seen
-        looked_at = 1 if initial_state is not None else max(1, round(_LOOK_AHEAD * self.fps))
+        begun, first = self._first_seen(frames, measured)
+        looked_at = 1 if initial_state is not None else self._looked_at
         begin = [first, *islice(frames, looked_at - 1)]
-        state = self.init(torch.stack(begin), initial_state, generator=generator, facing=facing)
-        state = state._replace(frame=begun)
+        if initial_state is None:
+            initial_state = self._first_state(begin, generator, facing)
+        state = self._begun(initial_state, generator)._replace(frame=begun)
         expected = None if n_frames is None else max(1, n_frames - begun)
         bar = tqdm(chain(begin, frames), total=expected, disable=not progress, unit="frame")
-        poses = self.advance(state, iter(bar))[1]
+        poses = self._followed(state, iter(bar))[1]
         if lengths is not None:
             there, later = begun + len(poses), sum(1 for _ in source)
             check_lengths(lengths, 1, there + later, lengths.device)
             poses = repeat_last(poses, later)
         if begun:
             poses.notes += (
-                f"the first {begun} frames, in which not all cameras saw somebody, have no pose",
+                f"the first {begun} frames, in which {_UNSEEN[measured is None]}, have no pose",
             )
         return poses
 
@@ -359,16 +368,22 @@ class BodyTracker(nn.Module):
         silhouettes: Bool[Tensor, "T C H W"] | None = None,
         initial_state: Float[Tensor, " D"] | None = None,
         *,
+        keypoints: Float[Tensor, "T C J 2"] | None = None,
+        confidence: Float[Tensor, "T C J"] | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Float[Tensor, "T C J"] | None = None,
         generator: torch.Generator | None = None,
         facing: Float[Tensor, "3"] | None = None,
     ) -> BodyStream:
         """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
 
-        A stream of keypoints begins with the first frame that has enough of them, and needs no argument.
+        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument.
 
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
-                afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
+                afterwards, with `step` or `advance`.
+            keypoints, confidence, names, covariance: of half a second, as in `forward`; the first pose is
+                then found in them. initial_state: the pose before the first frame [D], of
                 `body`, instead. generator: of random numbers; the state holds it. facing: as in `forward`.
 
         Returns:
@@ -381,22 +396,14 @@ class BodyTracker(nn.Module):
         if self.by_keypoints is not None:
             return BodyStream(None, 0, None)
         if initial_state is None:
-            if silhouettes is None:
+            if silhouettes is None and keypoints is None:
                 raise InputError(
-                    "tracking begins with silhouettes or an initial_state, got neither"
+                    "tracking begins with silhouettes, keypoints or an initial_state, got none"
                 )
-            found = find_first_pose(
-                self.upright, silhouettes, self.cameras, self._first_prior(), generator, fps=self.fps,
-                facing=facing,
-            ).state  # fmt: skip
-            initial_state = (
-                found if self._upright is None else self.upright.convert(found, self.body)
-            )
-        check_shape("initial_state", initial_state, [self.body.dim])
-        state = self.filter.init(
-            initial_state[None], generator=generator, initial_cov=self.initial_cov
-        )
-        return BodyStream(state, 0, generator)
+            given = given_keypoints(keypoints, confidence, names, covariance)
+            frames = list(self._observed(silhouettes, given)[0])
+            initial_state = self._first_state(frames, generator, facing)
+        return self._begun(initial_state, generator)
 
     @overload
     def step(
@@ -440,7 +447,7 @@ class BodyTracker(nn.Module):
         Args:
             state: the state from `init` or the step before; it is not changed (but a generator goes on).
             silhouettes: the silhouettes of one frame, bool [C, H, W].
-            keypoints, confidence, names, covariance, persons: of one frame, as in `forward`, for "kalman".
+            keypoints, confidence, names, covariance, persons: of one frame, as in `forward`.
 
         Returns:
             The next state, and the `BodyTrack` of this one frame. With `persons` a list of those who are
@@ -450,9 +457,11 @@ class BodyTracker(nn.Module):
             ShapeError, InputError, CameraError: as `forward`.
         """
         if self.by_keypoints is None:
-            if silhouettes is None:
-                raise InputError(f"method {self.method} takes silhouettes, got none")
-            return self.advance(state, [silhouettes])
+            self._check_kind("none", "none", persons)
+            given = given_keypoints(keypoints, confidence, names, covariance)
+            given = None if given is None else given.alone()
+            shown = None if silhouettes is None else [silhouettes]
+            return self._followed(state, self._observed(shown, given)[0])
         if keypoints is None:
             raise InputError(f"method {self.method} takes keypoints, got none")
         if isinstance(state.filter, BodyFilterState):
@@ -470,12 +479,20 @@ class BodyTracker(nn.Module):
 
     @torch.no_grad()
     def advance(
-        self, state: BodyStream, silhouettes: Iterable[Bool[Tensor, "C H W"]]
+        self,
+        state: BodyStream,
+        silhouettes: Iterable[Bool[Tensor, "C H W"]] | None = None,
+        *,
+        keypoints: Float[Tensor, "T C J 2"] | None = None,
+        confidence: Float[Tensor, "T C J"] | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Float[Tensor, "T C J"] | None = None,
     ) -> tuple[BodyStream, BodyTrack]:
         """Track some more frames: the same numbers as `step` for one after the other.
 
         Args:
             state: as in `step`. silhouettes: bool [T, C, H, W], or one frame [C, H, W] after the other.
+            keypoints, confidence, names, covariance: of T frames, as in `forward`.
 
         Returns:
             The next state, and the `BodyTrack` of these frames.
@@ -485,8 +502,103 @@ class BodyTracker(nn.Module):
         """
         if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
+        given = given_keypoints(keypoints, confidence, names, covariance)
+        return self._followed(state, self._observed(silhouettes, given)[0])
+
+    # --- silhouettes and keypoints of particle filters
+
+    def _check_kind(self, smoothing: str, refine: str, persons: str | int | None) -> None:
+        """Refuse what the Kalman filter alone does."""
+        if smoothing != "none":
+            raise InputError(
+                f"smoothing={smoothing!r} needs method={KEYPOINT_METHOD!r}; method {self.method} filters"
+            )
+        if refine != "none" or persons is not None:
+            given = "persons" if persons is not None else f"refine={refine!r}"
+            raise InputError(
+                f"{given} needs method={KEYPOINT_METHOD!r}; method {self.method} tracks one person in "
+                "cameras as they are given"
+            )
+
+    def _observed(
+        self, silhouettes: Iterable[Tensor] | None, given: GivenKeypoints | None
+    ) -> tuple[Iterator[Observed], KeypointFrame | None]:
+        """Return the frames one after the other, and the keypoints of all of them."""
+        if given is None:
+            if silhouettes is None:
+                raise InputError(
+                    f"method {self.method} takes silhouettes, keypoints or both, got none"
+                )
+            return map(Observed, silhouettes), None
+        if callable(self.filter.likelihood):
+            raise InputError(
+                "a callable likelihood takes observations of its own; leave out the keypoints"
+            )
+        measured = self._keypoint_measurer.measured(given)
+        return observed_frames(silhouettes, self._keypoint_measurer, measured), measured
+
+    @property
+    def _keypoint_measurer(self) -> BodyKeypointMeasurer:
+        """Return what makes measurements of keypoints; it is set up by the first ones."""
+        if self._measurer is None:
+            self._measurer = BodyKeypointMeasurer(
+                self.cameras, self.fps, self.upright, *self._keypoint_noise
+            )
+        return self._measurer
+
+    @property
+    def _looked_at(self) -> int:
+        return max(1, round(_LOOK_AHEAD * self.fps))
+
+    def _first_seen(
+        self, frames: Iterator[Observed], measured: KeypointFrame | None
+    ) -> tuple[int, Observed]:
+        """Return the first frame in which the person is seen well enough to begin."""
+        if measured is not None:
+            begun = self._keypoint_measurer.first_frame(measured)
+            found = next(((begun, one) for one in islice(frames, begun, None)), None)
+        else:
+            shown = ((t, one) for t, one in enumerate(frames) if all_see(_masks(one)))
+            found = next(shown, None)
+        if found is None:
+            raise NobodySeenError(
+                "nobody is seen by all cameras in any frame; check the silhouettes, or leave out the "
+                "camera that sees nobody"
+            )
+        return found
+
+    def _first_state(
+        self,
+        frames: Sequence[Observed],
+        generator: torch.Generator | None,
+        facing: Tensor | None,
+    ) -> Float[Tensor, " D"]:
+        """Return the pose of the first of some frames: from keypoints where there are any."""
+        keypoints = [one.keypoints.frame for one in frames if one.keypoints is not None]
+        if keypoints:
+            joined = KeypointFrame(*(torch.cat(v) for v in zip(*keypoints, strict=True)))
+            found = self._keypoint_measurer.first_pose(joined)
+        else:
+            found = find_first_pose(
+                self.upright, torch.stack([_masks(one) for one in frames]), self.cameras,
+                self._first_prior(), generator, fps=self.fps, facing=facing,
+            ).state  # fmt: skip
+        return found if self._upright is None else self.upright.convert(found, self.body)
+
+    def _begun(self, initial_state: Tensor, generator: torch.Generator | None) -> BodyStream:
+        check_shape("initial_state", initial_state, [self.body.dim])
+        state = self.filter.init(
+            initial_state[None], generator=generator, initial_cov=self.initial_cov
+        )
+        return BodyStream(state, 0, generator)
+
+    def _followed(
+        self, state: BodyStream, frames: Iterable[Observed]
+    ) -> tuple[BodyStream, BodyTrack]:
+        if not isinstance(state.filter, BodyFilterState):
+            raise InputError(f"expected the state of a tracker with method {self.method}")
         after, poses = follow(
-            self.filter, state.filter, silhouettes, self.cameras, state.generator, state.frame
+            self.filter, state.filter, frames, self.cameras, state.generator, state.frame
         )
         poses.fps, poses.method = self.fps, self.method
         poses.notes = (*self.notes, *poses.notes)
@@ -523,6 +635,13 @@ def _person(body: Body | str | Path | None, height: float) -> Body:
     if isinstance(body, Body):
         return body
     return Body.of_height(BODY_15, height) if body is None else load_body(body)
+
+
+def _masks(one: Observed) -> Tensor:
+    """Return the silhouettes of a frame that has them."""
+    if one.silhouettes is None:
+        raise InputError("expected silhouettes, got none")
+    return one.silhouettes
 
 
 def _whole(lengths: Int[Tensor, "1"]) -> int:

@@ -1,7 +1,7 @@
 """Track one person with any filter over bodies, frame after frame."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,10 +17,18 @@ from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._filters.body_frames import check_observation
 from torchpose.whole_body._filters.body_particles import BodyFilterState, stack_outputs
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 
-__all__ = ["all_see", "follow", "track_body"]
+__all__ = ["Observed", "all_see", "follow", "track_body"]
 
 _SEEN = 0.002  # of the image: fewer pixels are nobody
+
+
+class Observed(NamedTuple):
+    """Holds one frame of one person: silhouettes [C, H, W] or None, keypoints of one element or None."""
+
+    silhouettes: Tensor | None
+    keypoints: KeypointMeasurement | None = None
 
 
 def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
@@ -64,7 +72,7 @@ def track_body(
         raise InputError(f"the filter must track a Body, got {type(model.body).__name__}")
     state = model.init(initial_state[None], generator=generator, initial_cov=initial_cov)
     bar = tqdm(frames, total=n_frames, disable=not progress, unit="frame")
-    poses = follow(model, state, iter(bar), cameras, generator)[1]
+    poses = follow(model, state, map(Observed, bar), cameras, generator)[1]
     poses.fps = fps
     return poses
 
@@ -72,7 +80,7 @@ def track_body(
 def follow(
     model: SilhouetteParticleFilter,
     state: BodyFilterState,
-    frames: Iterable[Tensor],
+    frames: Iterable[Observed],
     cameras: Cameras,
     generator: Generators,
     first_frame: int = 0,
@@ -80,13 +88,16 @@ def follow(
     """Return the state after some frames, and their poses."""
     steps, covs = [], []
     body: Any = model.body
-    for silhouettes in frames:
-        check_observation(silhouettes[None], 1, plain=not callable(model.likelihood))
-        state, out = model.filter_frame(state, silhouettes[None], cameras, generator)
+    for silhouettes, keypoints in frames:
+        outlined = None if silhouettes is None else silhouettes[None]
+        if outlined is not None:
+            check_observation(outlined, 1, plain=not callable(model.likelihood))
+        more = () if keypoints is None else (keypoints,)
+        state, out = model.filter_frame(state, outlined, cameras, generator, *more)
         steps.append(out)
         covs.append(model.joint_covariance(state, out.mean)[0])
     if not steps:
-        raise InputError("there must be at least one frame of silhouettes, got none")
+        raise InputError("there must be at least one frame of silhouettes or keypoints, got none")
     batch = stack_outputs(steps)
     model.warn(batch)
     track = batch.element(0)

@@ -341,13 +341,13 @@ def test_options_of_other_methods_are_refused(options):
         tracker(ring(2), **options)
 
 
-def test_other_methods_take_no_keypoints(four):
-    with pytest.raises(InputError, match="kalman"):
-        BodyTracker(four.rig, "apf")(keypoints=four.keypoints)
-    with pytest.raises(InputError, match="kalman"):
-        BodyTracker(four.rig, "apf", keypoint_std=0.01)
+def test_other_methods_take_no_options_of_this_one(four):
     with pytest.raises(InputError, match="motion, up"):
         BodyTracker(four.rig, "apf", motion="whole-body", up="y")
+    with pytest.raises(InputError, match="refine='both' needs method='kalman'"):
+        BodyTracker(four.rig, "apf")(keypoints=four.keypoints, refine="both")
+    with pytest.raises(InputError, match="persons needs method='kalman'"):
+        BodyTracker(four.rig, "apf")(keypoints=four.keypoints, persons=2)
 
 
 def test_the_tracker_is_at_the_top():

@@ -10,6 +10,10 @@ from torch import Tensor
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError, ShapeError
 from torchpose.filters._recursive_filter import Generators, check_generators
+from torchpose.whole_body._keypoints.particle_likelihood import (
+    KeypointMeasurement,
+    keypoint_log_likelihood,
+)
 from torchpose.whole_body._silhouettes.likelihood import silhouette_log_likelihood
 from torchpose.whole_body._silhouettes.rendering import (
     PreparedSilhouettes,
@@ -28,6 +32,7 @@ __all__ = [
     "see_frame",
     "seen_until",
     "silhouette_score",
+    "with_keypoints",
 ]
 
 Score = Callable[[Tensor], Tensor]
@@ -42,13 +47,16 @@ class Frame(NamedTuple):
             sees.
         seen: [B], False where the frame is empty.
         silhouettes: `PreparedSilhouettes` of [B, C, H, W]; with a callable as the likelihood, what it
-            is given. cameras: as handed to the filter.
+            is given; None where there are keypoints alone. cameras: as handed to the filter.
+        keypoints: of the frame, or None. outlined: [B], whether there is a silhouette; as `seen` if None.
     """
 
     score: Score
     seen: Bool[Tensor, " B"]
     silhouettes: Any
     cameras: Any
+    keypoints: KeypointMeasurement | None = None
+    outlined: Bool[Tensor, " B"] | None = None
 
 
 def silhouette_score(
@@ -95,6 +103,30 @@ def see_frame(
     prepared = prepare_silhouettes(observed)
     raw = silhouette_score(body, prepared, cameras, likelihood, limb_shape)
     return Frame(_sharpened(raw, sharpness, seen), seen, prepared, cameras)
+
+
+def with_keypoints(body: Any, frame: Frame | None, measured: KeypointMeasurement | None) -> Frame:
+    """Return a frame whose keypoints are scored as well: log-likelihoods of both add.
+
+    Args:
+        body: whose joints the keypoints are of. frame: of silhouettes, or None. measured: keypoints, or None.
+
+    Raises:
+        InputError: neither of both.
+    """
+    if measured is None:
+        if frame is None:
+            raise InputError("a frame needs silhouettes or keypoints, got neither")
+        return frame
+    own = measured
+
+    def score(states: Tensor) -> Tensor:
+        value = keypoint_log_likelihood(own, body.joints(states))
+        return value if frame is None else value + frame.score(states)
+
+    if frame is None:
+        return Frame(score, own.seen, None, None, own, torch.zeros_like(own.seen))
+    return Frame(score, frame.seen | own.seen, frame.silhouettes, frame.cameras, own, frame.seen)
 
 
 def _sharpened(raw: Score, sharpness: float, seen: Bool[Tensor, " B"]) -> Score:

@@ -52,6 +52,10 @@ from torchpose.whole_body._filters.limb_observations import (
 )
 from torchpose.whole_body._filters.motion import default_step_std
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body._keypoints.particle_likelihood import (
+    keypoint_log_likelihood,
+    limbs_given_keypoints,
+)
 
 __all__ = ["PUBLISHED", "WEIGHTINGS", "RootUncertaintyTracker", "joint_covariance_with_parts"]
 
@@ -302,6 +306,28 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         self, roots: Tensor, mean: Tensor, covariance: Tensor, frame: Frame
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return hypotheses, covariances, and log-weights before annealing, given an image."""
+        value = roots.new_zeros(roots.shape[:2], dtype=torch.float64)
+        if frame.silhouettes is not None:
+            value, mean, covariance = self._outlined_parts(roots, mean, covariance, frame)
+        if frame.keypoints is not None:
+            states = self.body.with_relative(roots, mean.flatten(-2))
+            mean, covariance = limbs_given_keypoints(
+                frame.keypoints, self.body, states, mean, covariance, self.least_std
+            )
+        tree, transport = self.conditionals.tree, self.conditionals.transport
+        mean, covariance = propagate(mean, covariance, tree, transport)
+        particles = self.constrain(self.body.with_relative(roots, mean.flatten(-2)))
+        if self.weighting == "body":
+            return particles, covariance, frame.score(particles)
+        if frame.keypoints is not None:
+            joints = self.body.joints(particles)
+            value = value + keypoint_log_likelihood(frame.keypoints, joints)
+        return particles, covariance, value
+
+    def _outlined_parts(
+        self, roots: Tensor, mean: Tensor, covariance: Tensor, frame: Frame
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return log-weights before annealing, and the parts' Gaussians, given the silhouettes (DX 4, 12)."""
         points = sigma_points(mean, covariance, centre=True)
         counts = count_positions(
             self.body, roots, points, frame.cameras, frame.silhouettes, self.groups
@@ -311,12 +337,10 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         )
         sharp = self.observation_sharpness * likelihood
         observed = observation_gaussians(points, sharp, mean, covariance, self.least_std)
-        tree, transport = self.conditionals.tree, self.conditionals.transport
-        mean, covariance = propagate(*observed, tree, transport)
-        particles = self.constrain(self.body.with_relative(roots, mean.flatten(-2)))
-        if self.weighting == "body":
-            return particles, covariance, frame.score(particles)
-        return particles, covariance, likelihood.logsumexp(-1).sum(-1)
+        value = likelihood.logsumexp(-1).sum(-1)
+        if frame.outlined is not None:
+            value = torch.where(frame.outlined[:, None], value, 0.0)
+        return value, *observed
 
     def _memory(self, state: BodyFilterState) -> Tensor:
         return self.first_memory(state.particles) if state.memory is None else state.memory

@@ -28,12 +28,14 @@ from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._recursive_filter import Generators, standard_normal
 from torchpose.filters._resampling import RESAMPLING
 from torchpose.whole_body._filters.body_frames import (
+    Frame,
     Likelihood,
     check_observation,
     check_observations,
     check_sequences,
     see_frame,
     seen_until,
+    with_keypoints,
 )
 from torchpose.whole_body._filters.body_particles import (
     BodyFilterOutput,
@@ -47,6 +49,7 @@ from torchpose.whole_body._filters.body_particles import (
 from torchpose.whole_body._filters.hooks import BodyFilterHooks
 from torchpose.whole_body._filters.legs import check_leg_swap, extra_copies, swap_legs
 from torchpose.whole_body._filters.motion import diffusion_std, std_of_covariance
+from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 from torchpose.whole_body._silhouettes.outlines import check_limb_shape
 
@@ -289,22 +292,25 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         return state, track
 
     def filter_frame(
-        self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
+        self,
+        state: BodyFilterState,
+        silhouettes: Tensor | None,
+        cameras: Any,
+        generator: Generators,
+        keypoints: KeypointMeasurement | None = None,
     ) -> tuple[BodyFilterState, BodyFilterOutput]:
         """Track one more frame, as `step`, of checked silhouettes; without warnings.
 
         Args:
             state: the state of B elements, from `init` or the frame before.
-            silhouettes: bool [B, C, H, W]. cameras: the C cameras.
+            silhouettes: bool [B, C, H, W], or None with keypoints. cameras: the C cameras.
             generator: one generator, or a list of one for each element.
+            keypoints: of the frame, whose log-likelihood adds to that of the silhouettes, or None.
 
         Returns:
             The next state, and the `BodyFilterOutput` of the frame, [B, ...].
         """
-        frame = see_frame(
-            self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
-            self.sharpness, self.limb_shape,
-        )  # fmt: skip
+        frame = with_keypoints(self.body, self._outlined(silhouettes, cameras), keypoints)
         moved = self.move(self._resample(state, generator), frame, generator)
         dead = ~torch.isfinite(moved.log_weights.amax(-1))
         lost = torch.where(dead, state.lost + 1, 0)
@@ -372,6 +378,15 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         return zero.masked_fill(~self.limits.inside(particles).all(-1), -torch.inf)
 
     # --- helpers
+
+    def _outlined(self, silhouettes: Tensor | None, cameras: Any) -> Frame | None:
+        """Return the frame of silhouettes, if there are any."""
+        if silhouettes is None:
+            return None
+        return see_frame(
+            self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
+            self.sharpness, self.limb_shape,
+        )  # fmt: skip
 
     def _resample(self, state: BodyFilterState, generator: Generators) -> BodyFilterState:
         """Resample where it is due, and exchange the legs of some extra copies."""

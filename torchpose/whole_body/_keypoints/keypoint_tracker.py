@@ -23,9 +23,9 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
-__all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
+__all__ = ["LEAST_JOINTS", "KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
 
-_LEAST_JOINTS = 6  # that are measured where tracking begins
+LEAST_JOINTS = 6  # that are measured where tracking begins
 _HYPOTHESES = 16  # that are tracked from one camera, which does not see the depth of limbs
 _SHARE = (
     0.1  # of a frame's evidence about hypotheses: its errors are like those of the frames before
@@ -136,7 +136,7 @@ class KeypointTracker(nn.Module):
             The next stream, the poses of the frame [B, ...], and the corrected hypotheses as one Gaussian.
         """
         n_joints = (frame.inlier > 0).any(-2).sum(-1)
-        enough = n_joints >= _LEAST_JOINTS
+        enough = n_joints >= LEAST_JOINTS
         if stream is None:
             due = torch.ones_like(enough)
             stream, found = self._started(frame)

@@ -1,0 +1,135 @@
+"""Give keypoints to the particle filters over bodies: frames of measurements, and the first pose."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose._core.checks import check_shape
+from torchpose.body._fitting import fit_state
+from torchpose.body._kinematics import Body
+from torchpose.camera._rig import CameraRig
+from torchpose.errors import InputError, NobodySeenError
+from torchpose.whole_body._following import Observed
+from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS
+from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
+
+__all__ = ["BodyKeypointMeasurer", "GivenKeypoints", "given_keypoints", "observed_frames"]
+
+
+class GivenKeypoints(NamedTuple):
+    """Holds keypoints as `BodyTracker` takes them, for T frames."""
+
+    keypoints: Tensor
+    confidence: Tensor | None = None
+    names: Sequence[str] | None = None
+    covariance: Tensor | None = None
+
+    def alone(self) -> "GivenKeypoints":
+        """Return the keypoints of one frame as those of a sequence of one."""
+        confidence, covariance = (
+            None if value is None else value[None] for value in (self.confidence, self.covariance)
+        )
+        return GivenKeypoints(self.keypoints[None], confidence, self.names, covariance)
+
+
+def given_keypoints(
+    keypoints: Tensor | None,
+    confidence: Tensor | None,
+    names: Sequence[str] | None,
+    covariance: Tensor | None,
+) -> GivenKeypoints | None:
+    """Return keypoints with what belongs to them, None if there are none."""
+    if keypoints is None:
+        return None
+    return GivenKeypoints(keypoints, confidence, names, covariance)
+
+
+class BodyKeypointMeasurer:
+    """Makes measurements for particle filters of a detector's keypoints.
+
+    Args:
+        rig: the cameras. fps: frames per second. body: upright, of which the first pose is.
+        keypoint_std, pixel_std: as `BodyTracker`.
+
+    Raises:
+        InputError, CameraError, SkeletonError: as `KeypointBodyTracker`.
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        fps: float,
+        body: Body,
+        keypoint_std: float | None,
+        pixel_std: float | None,
+    ) -> None:
+        self.body, self.maps = body, RigMaps.of(rig)
+        self.tracker = KeypointBodyTracker(
+            rig, fps, body=body, keypoint_std=keypoint_std, pixel_std=pixel_std
+        )
+
+    def measured(self, given: GivenKeypoints) -> KeypointFrame:
+        """Return the keypoints of T frames [T, C, 15, ...], with their noise and trust.
+
+        Raises:
+            ShapeError, InputError, CameraError: as `BodyTracker.forward`.
+        """
+        check_shape("keypoints", given.keypoints, ["T", len(self.tracker.rig), None, 2])
+        return self.tracker.frames(*given)
+
+    def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
+        """Return the measurement of one frame, of one element."""
+        return KeypointMeasurement(KeypointFrame(*(v[t : t + 1] for v in frames)), self.maps)
+
+    def first_frame(self, frames: KeypointFrame) -> int:
+        """Return the first frame with enough joints for a first pose.
+
+        Raises:
+            NobodySeenError: there is none.
+        """
+        enough = (frames.inlier > 0).any(1).sum(-1) >= LEAST_JOINTS
+        if not bool(enough.any()):
+            raise NobodySeenError(
+                f"no frame has keypoints of {LEAST_JOINTS} joints or more; check the keypoints and "
+                "their names"
+            )
+        return int(enough.int().argmax())
+
+    def first_pose(self, frames: KeypointFrame) -> Float[Tensor, " D"]:
+        """Return the pose of the first of some frames, as the Kalman smoother finds it in all of them."""
+        batch = KeypointFrame(*(value[None] for value in frames))
+        joints = self.tracker.tracker(batch, smoothing=True).joints[0, :1]
+        return fit_state(self.body, joints)[0]
+
+
+def observed_frames(
+    silhouettes: Iterable[Tensor] | None,
+    measurer: BodyKeypointMeasurer | None,
+    frames: KeypointFrame | None,
+) -> Iterator[Observed]:
+    """Yield frames of silhouettes, of keypoints, or of both.
+
+    Raises:
+        InputError: silhouettes and keypoints of different numbers of frames.
+    """
+    if frames is None or measurer is None:
+        yield from map(Observed, silhouettes or ())
+        return
+    count = len(frames.pixels)
+    if silhouettes is None:
+        yield from (Observed(None, measurer.observed(frames, t)) for t in range(count))
+        return
+    t = 0
+    for t, outlined in enumerate(silhouettes, 1):
+        if t > count:
+            break
+        yield Observed(outlined, measurer.observed(frames, t - 1))
+    if t != count:
+        raise InputError(
+            f"silhouettes and keypoints must have the same number of frames, got {t} or more of "
+            f"silhouettes and {count} of keypoints"
+        )
