@@ -309,9 +309,9 @@ class Films:
             if 0 <= t - poses.first_frame < len(poses)
         ]
         drawn = list(images)
-        for order, (place, poses) in enumerate(there):
+        for order, (place, poses) in enumerate(there, 1):
             tint = None if len(people) == 1 else place
-            drawn = [self._drawn(image, poses, t, c, tint, order == 0)
+            drawn = [self._drawn(image, poses, t, c, tint, order == len(there))
                      for c, image in enumerate(drawn)]  # fmt: skip
         return drawn
 
