@@ -49,16 +49,22 @@ def openpose_name(joint: str) -> str:
     return IN_OPENPOSE.get(joint, side[:1].upper() + kind.capitalize())
 
 
-def write_openpose(folder, points) -> None:
-    """The keypoints [T, 15, 2] of one person as OpenPose writes them, without the head."""
+def write_openpose(folder, *people) -> None:
+    """Keypoints [T, 15, 2] of persons as OpenPose writes them, without the head, in an order that changes.
+
+    Frames of NaN are without the person.
+    """
     folder.mkdir()
-    table = np.zeros((len(points), len(OPENPOSE), 3))
+    table = np.zeros((len(people[0]), len(people), len(OPENPOSE), 3))
     for j, joint in enumerate(BODY_15.names):
         if joint != "head":
-            table[:, OPENPOSE.index(openpose_name(joint)), :2] = points[:, j]
-            table[:, OPENPOSE.index(openpose_name(joint)), 2] = 0.9
-    for t, person in enumerate(table):
-        content = {"people": [{"pose_keypoints_2d": person.ravel().tolist()}]}
+            at = OPENPOSE.index(openpose_name(joint))
+            table[:, :, at, :2] = np.stack([points[:, j] for points in people], 1)
+            table[:, :, at, 2] = 0.9
+    for t, frame in enumerate(table):
+        there = [person for person in frame if np.isfinite(person).all()]
+        people = [{"pose_keypoints_2d": person.ravel().tolist()} for person in there]
+        content = {"people": people[::-1] if t % 2 else people}
         (folder / f"video_{t:012d}_keypoints.json").write_text(json.dumps(content))
 
 

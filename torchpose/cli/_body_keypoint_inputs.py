@@ -42,11 +42,13 @@ class DetectorSettings(NamedTuple):
 
 
 class CameraKeypoints(NamedTuple):
-    """Holds the keypoints of one camera.
+    """Holds the keypoints of one camera, of D detections: of everybody, or of one who is followed.
 
     Attributes:
-        points: of the joints of `BODY_15` [T, 15, 2], pixels, NaN where missing.
-        confidence: [T, 15]. fps, size: of the images, (width, height), None if unknown. notes: of the reader.
+        points: of the joints of `BODY_15` [T, D, 15, 2], pixels, NaN where missing.
+        confidence: [T, D, 15].
+        fps, size: of the images, (width, height), None if unknown. notes: of the reader.
+        n_people: how many people the frames show [T], where one of them is followed.
     """
 
     points: Tensor
@@ -54,14 +56,16 @@ class CameraKeypoints(NamedTuple):
     fps: float | None
     size: tuple[int, int] | None
     notes: tuple[str, ...] = ()
+    n_people: Tensor | None = None
 
 
 class BodyKeypoints(NamedTuple):
     """Holds the keypoints of all cameras, in step.
 
     Attributes:
-        points: of the joints of `BODY_15` [T, C, 15, 2], pixels, NaN where missing.
-        confidence: [T, C, 15]. cameras: for the images in which the keypoints are.
+        points: of the joints of `BODY_15` [T, C, 15, 2], pixels, NaN where missing; of everybody
+            [T, C, D, 15, 2], of D detections in any order.
+        confidence: [T, C, 15] or [T, C, D, 15]. cameras: for the images in which the keypoints are.
         fps: frames per second. notes: on what was assumed.
     """
 
@@ -104,6 +108,7 @@ def read_body_keypoints(
     fps: float | None = None,
     delays: Sequence[int] | None = None,
     other_rates: Sequence[float] = (),
+    everybody: bool = False,
 ) -> BodyKeypoints:
     """Read the keypoints of all cameras and bring them in step.
 
@@ -112,6 +117,7 @@ def read_body_keypoints(
         cameras: calibrated, in the same order. detector: of the keypoints in videos.
         fps: of all inputs. delays: frames by which each began too early.
         other_rates: of videos of the same recording, which count where no input states a rate.
+        everybody: take all people of every frame, and not one who is followed.
 
     Raises:
         InputError, FileFormatError, SkeletonError: inputs that cannot be read, different frame rates.
@@ -119,7 +125,7 @@ def read_body_keypoints(
     """
     from torchpose.camera._choice import fit_to_size
 
-    parts = [_read(path, detector, fps) for path in inputs]
+    parts = [_read(path, detector, fps, everybody) for path in inputs]
     fitted = [
         fit_to_size(camera, part.size, path)
         for camera, part, path in zip(cameras, parts, inputs, strict=True)
@@ -131,7 +137,23 @@ def read_body_keypoints(
     notes += tuple(
         f"{path}: {n}" for path, part in zip(inputs, parts, strict=True) for n in part.notes
     )
+    notes += tuple(_crowd_notes(parts, cameras))
+    if not everybody:
+        points, confidence = points[:, :, 0], confidence[:, :, 0]
     return BodyKeypoints(points, confidence, [camera for camera, _ in fitted], rate, notes)
+
+
+def _crowd_notes(
+    parts: Sequence[CameraKeypoints], cameras: "Sequence[PinholeCamera]"
+) -> Iterator[str]:
+    """Say in which cameras several people stand, of whom one is followed."""
+    for part, camera in zip(parts, cameras, strict=True):
+        several = torch.zeros(0) if part.n_people is None else (part.n_people > 1).nonzero()
+        if part.n_people is not None and len(several):
+            yield (
+                f"camera {camera.name}: several people, up to {int(part.n_people.max())}, from frame "
+                f"{int(several[0])} on; one of them is tracked, and --persons all tracks everybody"
+            )
 
 
 def common_rate(rates: Sequence[float], given: float | None) -> tuple[float, tuple[str, ...]]:
@@ -168,31 +190,51 @@ def _in_step(
         )
     n = min(lengths)
     rows = [slice(delay, delay + n) for delay in delays]
-    points = torch.stack([p.points[r] for p, r in zip(parts, rows, strict=True)], 1)
-    confidence = torch.stack([p.confidence[r] for p, r in zip(parts, rows, strict=True)], 1)
+    most = max(part.points.shape[1] for part in parts)
+    points = torch.stack(
+        [_padded(p.points[r], most, torch.nan) for p, r in zip(parts, rows, strict=True)], 1
+    )
+    confidence = torch.stack(
+        [_padded(p.confidence[r], most, 0.0) for p, r in zip(parts, rows, strict=True)], 1
+    )
     shown = ", ".join(map(str, lengths))
     note = f"the inputs have {shown} frames; the first {n} of each are used"
     return points, confidence, (note,) * (len(set(lengths)) > 1)
 
 
+def _padded(values: Tensor, most: int, missing: float) -> Tensor:
+    """Return values [T, D, ...] with more detections, which are missing."""
+    more = values.new_full((len(values), most - values.shape[1], *values.shape[2:]), missing)
+    return torch.cat([values, more], 1)
+
+
 # --- one camera -----------------------------------------------------------------------------------
 
 
-def _read(path: str, detector: DetectorSettings | None, fps: float | None) -> CameraKeypoints:
+def _read(
+    path: str, detector: DetectorSettings | None, fps: float | None, everybody: bool
+) -> CameraKeypoints:
     if detector is not None and is_video(path):
-        return _detect(path, detector, fps)
+        return _detect(path, detector, fps, everybody)
+    from torchpose.io._formats.openpose import read_openpose_people
     from torchpose.io._keypoints import read_keypoints
 
+    if everybody and Path(path).is_dir():
+        table, trust, names = read_openpose_people(path)
+        of_body = _of_body(path, torch.from_numpy(table), torch.from_numpy(trust), names)
+        return CameraKeypoints(*of_body, None, None)
     found = read_keypoints(path)
     points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
     notes = found.notes if count_given(found.names) == len(found.names) else ()
-    return CameraKeypoints(points, confidence, found.fps, found.image_size, notes)
+    return CameraKeypoints(
+        points[:, None], confidence[:, None], found.fps, found.image_size, notes, found.n_people
+    )
 
 
 def _of_body(
     source: str, points: Tensor, confidence: Tensor | None, names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
-    """Return keypoints [T, 15, 2] and confidence [T, 15] of the joints of `BODY_15`.
+    """Return keypoints [..., 15, 2] and confidence [..., 15] of the joints of `BODY_15`.
 
     Heads and necks that were put where the prior of the upper body has them are none of this body.
     """
@@ -210,21 +252,38 @@ def _of_body(
     return joints[..., :2], joints[..., 2].nan_to_num(0.0)
 
 
-def _detect(path: str, settings: DetectorSettings, fps: float | None) -> CameraKeypoints:
-    """Find the keypoints of the person whom most frames of a video show."""
+def _detect(
+    path: str, settings: DetectorSettings, fps: float | None, everybody: bool
+) -> CameraKeypoints:
+    """Find the keypoints in a video, of everybody or of the person whom most frames show."""
     from torchpose.video._source import open_video
 
     with open_video(path, fps=fps) as source:
         measurer = _measurer(settings, source.fps)
         frames = list(_measured(measurer, source))
-        person, notes = _most_seen(frames)
-        points = torch.full((len(frames), len(measurer.names), 2), torch.nan, dtype=torch.float64)
-        confidence = torch.zeros(points.shape[:2], dtype=torch.float64)
-        for t, frame in enumerate(frames):
-            for row in (frame.person == person).nonzero().flatten().tolist():
-                points[t], confidence[t] = frame.keypoints[row], frame.confidence[row]
+        notes: tuple[str, ...] = ()
+        if not everybody:
+            person, notes = _most_seen(frames)
+            frames = [_of_person(frame, person) for frame in frames]
+        points, confidence = _table(frames, len(measurer.names))
         points, confidence = _of_body(settings.where, points, confidence, measurer.names)
         return CameraKeypoints(points, confidence, source.fps, source.size, (*source.notes, *notes))
+
+
+def _of_person(frame: "FrameKeypoints", person: int) -> "FrameKeypoints":
+    rows = frame.person == person
+    return type(frame)(*(value[rows] for value in frame))
+
+
+def _table(frames: "Sequence[FrameKeypoints]", n_joints: int) -> tuple[Tensor, Tensor]:
+    """Return keypoints [T, D, J, 2] and confidence [T, D, J] of the detections of all frames."""
+    most = max([1, *(len(frame.person) for frame in frames)])
+    points = torch.full((len(frames), most, n_joints, 2), torch.nan, dtype=torch.float64)
+    confidence = torch.zeros(points.shape[:3], dtype=torch.float64)
+    for t, frame in enumerate(frames):
+        n = len(frame.person)
+        points[t, :n], confidence[t, :n] = frame.keypoints, frame.confidence
+    return points, confidence
 
 
 def _measurer(settings: DetectorSettings, fps: float) -> "KeypointMeasurer":
@@ -253,5 +312,8 @@ def _most_seen(frames: "Sequence[FrameKeypoints]") -> tuple[int, tuple[str, ...]
     if not seen:
         return -1, ("the detector found nobody",)
     person, count = seen.most_common(1)[0]
-    note = f"of {len(seen)} persons the one in most frames ({count} of {len(frames)}) is tracked"
+    note = (
+        f"of {len(seen)} persons the one in most frames ({count} of {len(frames)}) is tracked; --persons all "
+        "tracks everybody"
+    )
     return person, (note,) * (len(seen) > 1)

@@ -3,6 +3,7 @@
 import sys
 import time
 import warnings
+from argparse import ArgumentError
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,7 +21,7 @@ from torchpose.cli._track_body_output import (
     facts_of,
     summary,
     write_page,
-    write_poses,
+    write_people,
 )
 from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, NobodySeenError
 
@@ -33,6 +34,7 @@ _EXAMPLES = """
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --fps 60 --smoothing full --out result
 torchpose track-body cameras.toml cam1.npz cam2.csv --videos cam1.mp4 cam2.mp4 --out result
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --refine both --out result
+torchpose track-body cameras.toml cam1_json/ cam2_json/ --persons all --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 --detector rtmpose-m.onnx --out result
 torchpose track-body cameras.toml cam*.npz --formats trc c3d bvh --up z --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -54,7 +56,7 @@ _OF_SILHOUETTES = (
     "conditionals", "action", "n_particles",
 )  # fmt: skip
 _OF_KEYPOINTS = (
-    "smoothing", "refine", "videos", "keypoint_std", "pixel_std", "motion", "min_confidence",
+    "smoothing", "refine", "persons", "videos", "keypoint_std", "pixel_std", "motion", "min_confidence",
 )  # fmt: skip
 _BY_KEYPOINTS = "kalman"
 
@@ -78,6 +80,7 @@ def command() -> Command:
             "method_options": _method_options(),
         },
         spaced=("inputs", "background", "videos", "formats"),
+        parse={"persons": parse_persons},
         metavars={
             "cameras": "CAMERAS",
             "inputs": "INPUT",
@@ -87,6 +90,7 @@ def command() -> Command:
             "formats": "trc|c3d|bvh",
             "smoothing": "none|full",
             "refine": "none|delays|extrinsics|both",
+            "persons": "all|N",
         },
     )
 
@@ -112,6 +116,7 @@ def run(
     min_confidence: float | None = None,
     smoothing: Literal["none", "full"] = "none",
     refine: Literal["none", "delays", "extrinsics", "both"] = "none",
+    persons: str | int | None = None,
     videos: list[str] | None = None,
     background: list[str] | None = None,
     ignore_still: bool = False,
@@ -131,7 +136,7 @@ def run(
     pictures: bool = True,
     given: Given,
 ) -> int:
-    """Track one person's whole body in calibrated cameras: by 2D keypoints, or in videos by silhouettes.
+    """Track whole bodies in calibrated cameras: of persons by 2D keypoints, of one in videos by silhouettes.
 
     The cameras stand still. Keypoints are those of files, or with --detector those that a model finds in
     videos; one camera is enough for them. Writes body.npz, joints.csv, an overlay of every camera,
@@ -149,6 +154,7 @@ def run(
         smoothing: keypoints: "full" lets later frames count too.
         refine: keypoints: estimate the cameras' delays against the first, their poses (extrinsics), or both
             from the person who moves, and write refined_cameras.toml.
+        persons: keypoints: track several persons, all or at most N at a time; without it one is followed.
         videos: keypoints: a video per camera, into which the body is drawn; by default the inputs, if they
             are videos.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
@@ -215,14 +221,30 @@ def run(
                     file=sys.stderr,
                 )
                 return 1
-            written = results.commit(write_poses(job, results.stage, poses))
+            written = results.commit(write_people(job, results.stage, [poses]))
             shown = []
             if overlay or job.pictures:
-                shown = draw(recordings, poses, results.stage, overlay, job.pictures)
+                shown = draw(recordings, [poses], results.stage, overlay, job.pictures)
         facts = facts_of(given, body_tracker, recordings, poses, seconds)
-        shown += write_page(recordings.views[0].source, poses, facts, results.stage)
+        shown += write_page(recordings.views[0].source, [poses], facts, results.stage)
         written += results.commit(shown)
-    return summary(poses, facts, written, results.notes)
+    return summary([poses], facts, written, results.notes)
+
+
+def parse_persons(value: Any) -> int | str:
+    """Return "all", or a number of persons.
+
+    Raises:
+        ArgumentError: anything else.
+    """
+    text = str(value)
+    if text == "all":
+        return text
+    if not text.isdecimal() or int(text) < 1:
+        raise ArgumentError(
+            None, f"--persons must be 'all' or a number of persons from 1 on, got {text!r}"
+        )
+    return int(text)
 
 
 def _run_on_keypoints(
@@ -243,7 +265,7 @@ def _run_on_keypoints(
     arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
     settings = KeypointSettings(
         detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments,
-        values["refine"],
+        values["refine"], values["persons"],
     )  # fmt: skip
     return track_keypoints(job, inputs, cameras, settings)
 
@@ -274,6 +296,11 @@ def _refuse_others(given: Given, by_keypoints: bool) -> None:
     if not by_keypoints and given.values["up"] is not None and not given.values["formats"]:
         raise InputError(
             "--up is for keypoints and for the files of --formats; the other results are in world axes"
+        )
+    if given.values["persons"] is not None and given.values["refine"] != "none":
+        raise InputError(
+            "--refine is for recordings of one person, and --persons is given; refine the cameras on a "
+            "recording of one, and track with its refined_cameras.toml"
         )
     if by_keypoints and detector is None and given.values["min_confidence"] is not None:
         raise InputError(

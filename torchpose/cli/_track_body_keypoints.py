@@ -19,10 +19,11 @@ from torchpose.cli._track_body_output import (
     BodyJob,
     body_results,
     draw,
+    person_suffix,
     project_joints,
     summary,
     write_page,
-    write_poses,
+    write_people,
 )
 from torchpose.cli._track_output import percent, smoothing_text
 from torchpose.errors import NobodySeenError
@@ -51,6 +52,7 @@ class KeypointSettings(NamedTuple):
         videos: into which the body is drawn, for each camera; None for the inputs, if they are videos.
         fps: of all inputs, None if they tell. delays: frames by which each began too early.
         tracker: the arguments of `BodyTracker`. refine: what of the cameras is estimated.
+        persons: "all", or how many there are at most at a time; None for the one who is followed.
     """
 
     detector: DetectorSettings | None
@@ -60,6 +62,7 @@ class KeypointSettings(NamedTuple):
     delays: list[int] | None
     tracker: dict[str, Any]
     refine: str = "none"
+    persons: str | int | None = None
 
 
 def track_keypoints(
@@ -68,7 +71,7 @@ def track_keypoints(
     cameras: "Sequence[PinholeCamera]",
     settings: KeypointSettings,
 ) -> int:
-    """Track a body, write and report, and return the exit code: 1 if there is nobody or tracking is lost.
+    """Track bodies, write and report, and return the exit code: 1 if there is nobody or tracking is lost.
 
     Args:
         job: of the command. inputs: keypoints or videos, for each camera. cameras: calibrated.
@@ -89,23 +92,30 @@ def track_keypoints(
         keypoints = read_body_keypoints(
             inputs, cameras, detector=settings.detector, fps=settings.fps, delays=settings.delays,
             other_rates=[] if films is None else films.rates,
+            everybody=settings.persons is not None,
         )  # fmt: skip
         start = time.perf_counter()
-        poses = _track(keypoints, settings)
+        people = _track(keypoints, settings)
         seconds = time.perf_counter() - start
-        if poses is None:
-            print("torchpose: no camera has a keypoint, so there are no poses", file=sys.stderr)
+        if not people:
+            print(f"torchpose: {_nobody(keypoints)}, so there are no poses", file=sys.stderr)
             return 1
         stage, drawn = results.stage, []
-        keypoints, cameras_file = _refined(keypoints, settings, poses, stage)
-        written = results.commit([*write_poses(job, stage, poses), *cameras_file])
+        keypoints, cameras_file = _refined(keypoints, settings, people[0], stage)
+        written = results.commit([*write_people(job, stage, people), *cameras_file])
         if films is not None:
-            drawn = draw(films.showing(keypoints), poses, stage, overlay, job.pictures)
+            drawn = draw(films.showing(keypoints), people, stage, overlay, job.pictures)
         if job.pictures:
-            drawn += [_write_skeleton(stage / "skeleton.png", poses, cameras[0])]
-        facts = _facts(keypoints, settings, poses, seconds)
-        written += results.commit([*drawn, *write_page(cameras[0], poses, facts, stage)])
-    return summary(poses, facts, written, results.notes)
+            drawn += _write_skeletons(stage, people, cameras[0])
+        facts = _facts(keypoints, settings, people, seconds)
+        written += results.commit([*drawn, *write_page(cameras[0], people, facts, stage)])
+    return summary(people, facts, written, results.notes)
+
+
+def _nobody(keypoints: BodyKeypoints) -> str:
+    if not bool((keypoints.confidence > 0).any()):
+        return "no camera has a keypoint"
+    return "nobody was seen for long enough by cameras that agree"
 
 
 def _more(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
@@ -141,40 +151,66 @@ def _tracker(
     return BodyTracker(cameras, KEYPOINT_METHOD, fps=fps, **settings.tracker)
 
 
-def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "BodyTrack | None":
-    """Return the poses, or None if there is nobody."""
+def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "list[BodyTrack]":
+    """Return the poses of everybody."""
     tracker = _tracker(keypoints.cameras, keypoints.fps, settings)
     try:
-        poses = tracker(
-            keypoints=keypoints.points, confidence=keypoints.confidence,
+        found = tracker(
+            keypoints=keypoints.points, confidence=keypoints.confidence, persons=settings.persons,
             smoothing=settings.smoothing, refine=settings.refine, progress=show_progress(),
         )  # fmt: skip
     except NobodySeenError:
-        return None
-    return replace(poses, notes=(*keypoints.notes, *poses.notes))
+        return []
+    people = [found] if settings.persons is None else found
+    return [replace(poses, notes=(*keypoints.notes, *poses.notes)) for poses in people]
 
 
 def _facts(
-    keypoints: BodyKeypoints, settings: KeypointSettings, poses: "BodyTrack", seconds: float
+    keypoints: BodyKeypoints,
+    settings: KeypointSettings,
+    people: "Sequence[BodyTrack]",
+    seconds: float,
 ) -> dict[str, str]:
     """Return what was tracked, and how, by the name of each fact."""
     source = "files" if settings.detector is None else settings.detector.where
     n_cameras = len(keypoints.cameras)
+    everybody = settings.persons is not None
+    agreement = (
+        {"persons": str(len(people)), "detected": _detected(keypoints, people)}
+        if everybody
+        else {"agreement": _agreement(keypoints, people[0])}
+    )
     return {
         "keypoints": f"{n_cameras} camera{'s' * (n_cameras > 1)}, {keypoints.fps:g} fps, by {source}",
-        "method": poses.method + smoothing_text("full" if settings.smoothing == "full" else None),
-        "body": _body_text(poses, settings.tracker),
-        "agreement": _agreement(keypoints, poses),
-        "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
+        "method": people[0].method
+        + smoothing_text("full" if settings.smoothing == "full" else None),
+        "body": _body_text(people, settings.tracker),
+        **agreement,
+        "speed": f"{_count(keypoints, people) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
 
 
-def _body_text(poses: "BodyTrack", given: dict[str, Any]) -> str:
-    """Return whose body it is, or the height that its bones have."""
+def _count(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> int:
+    """Return the number of frames that were tracked."""
+    return len(people[0]) if len(people) == 1 else len(keypoints.points)
+
+
+def _body_text(people: "Sequence[BodyTrack]", given: dict[str, Any]) -> str:
+    """Return whose body it is, or the heights that the bones have."""
     if given["body"] is not None:
         return str(given["body"])
     known = "" if given["height"] is None else f", {given['height']:g} m given"
-    return f"{poses.body.height:.2f} m by its bones{known}"
+    heights = ", ".join(f"{poses.body.height:.2f} m" for poses in people)
+    return f"{heights} by {'its' if len(people) == 1 else 'their'} bones{known}"
+
+
+def _detected(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> str:
+    """Return the share of the persons' frames in which each camera had a detection of theirs."""
+    import torch
+
+    there = torch.cat([poses.details["detection"] >= 0 for poses in people]).double().mean(0)
+    pairs = zip(keypoints.cameras, there.tolist(), strict=True)
+    return ", ".join(f"{camera.name} {percent(share)}" for camera, share in pairs)
 
 
 def _agreement(keypoints: BodyKeypoints, poses: "BodyTrack") -> str:
@@ -186,6 +222,16 @@ def _agreement(keypoints: BodyKeypoints, poses: "BodyTrack") -> str:
         share = percent(float(inlier.mean())) if len(inlier) else "no keypoints"
         shares.append(f"{camera.name} {share}")
     return ", ".join(shares)
+
+
+def _write_skeletons(
+    out: "Path", people: "Sequence[BodyTrack]", camera: "PinholeCamera"
+) -> "list[Path]":
+    """Draw everybody's skeleton: skeleton.png, skeleton_p02.png and so on."""
+    return [
+        _write_skeleton(out / f"skeleton{person_suffix(place)}.png", poses, camera)
+        for place, poses in enumerate(people)
+    ]
 
 
 def _write_skeleton(path: "Path", poses: "BodyTrack", camera: "PinholeCamera") -> "Path":
@@ -201,7 +247,7 @@ def _write_skeleton(path: "Path", poses: "BodyTrack", camera: "PinholeCamera") -
 
 
 class Films:
-    """The videos that the body is drawn into; a context manager, which closes them.
+    """The videos that bodies are drawn into; a context manager, which closes them.
 
     Args:
         videos: one for each camera. cameras: calibrated. delays: frames by which each began too early.
@@ -255,23 +301,35 @@ class Films:
             for frames in frames_in_step(sources, self._delays):
                 yield tuple(frame.image for frame in frames)
 
-    def drawn(self, poses: "BodyTrack", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the body and its keypoints."""
+    def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
+        """Return the images of frame t of all cameras with the bodies and all keypoints."""
+        there = [
+            (place, poses)
+            for place, poses in enumerate(people)
+            if 0 <= t - poses.first_frame < len(poses)
+        ]
+        drawn = list(images)
+        for order, (place, poses) in enumerate(there, 1):
+            tint = None if len(people) == 1 else place
+            drawn = [self._drawn(image, poses, t, c, tint, order == len(there))
+                     for c, image in enumerate(drawn)]  # fmt: skip
+        return drawn
+
+    def _drawn(
+        self, image: Any, poses: "BodyTrack", t: int, c: int, tint: int | None, crosses: bool
+    ) -> Any:
+        """Return the image of camera c with one body; `tint` is the place of one of several."""
         import torch
 
         from torchpose.video._overlay import draw_body
 
-        delays = poses.details.get("camera_delays", torch.zeros(1, len(images)))[0].round().long()
-        at = (t - poses.first_frame - delays).clamp(0, len(poses) - 1)
-        return [
-            draw_body(
-                image,
-                project_joints(poses.joints3d[at[c]], camera),
-                poses.body.skeleton,
-                keypoints=self._seen(t, c),
-            )
-            for c, (image, camera) in enumerate(zip(images, self._cameras, strict=True))
-        ]
+        delays = poses.details.get("camera_delays", torch.zeros(1, len(self._cameras)))[0]
+        at = int((t - poses.first_frame - delays[c].round().long()).clamp(0, len(poses) - 1))
+        return draw_body(
+            image, project_joints(poses.joints3d[at], self._cameras[c]), poses.body.skeleton,
+            keypoints=self._seen(t, c) if crosses else None,
+            label="" if tint is None else f"person {tint + 1}", tint=tint,
+        )  # fmt: skip
 
     def _open(self, i: int) -> "VideoSource":
         from torchpose.video._source import open_video
@@ -280,7 +338,7 @@ class Films:
         return open_video(self._videos[i], fps=None if same else self.fps)
 
     def _seen(self, t: int, c: int) -> "Tensor":
-        """Return the keypoints of a camera in pixels of its video."""
+        """Return the keypoints of a camera in pixels of its video, [K, 2] of all detections."""
         measured, shown = self._keypoints.cameras[c].matrix, self._cameras[c].matrix
         scale = shown.diagonal()[:2] / measured.diagonal()[:2]
-        return (self._keypoints.points[t, c] + 0.5) * scale - 0.5
+        return (self._keypoints.points[t, c].reshape(-1, 2) + 0.5) * scale - 0.5

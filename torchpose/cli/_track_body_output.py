@@ -25,15 +25,17 @@ __all__ = [
     "body_results",
     "draw",
     "facts_of",
+    "person_suffix",
     "project_joints",
     "summary",
     "write_page",
-    "write_poses",
+    "write_people",
 ]
 
 _POSES = ("body.npz", "joints.csv")
 _OWN = (
-    r"body\.(npz|trc|c3d|bvh)|joints\.csv|overlay(_.+\.mp4|\.png)|skeleton\.png|report\.html"
+    r"(body(_p\d\d+)?\.(npz|trc|c3d|bvh)|joints(_p\d\d+)?\.csv|skeleton(_p\d\d+)?\.png)"
+    r"|overlay(_.+\.mp4|\.png)|report\.html"
     r"|refined_cameras\.toml"
 )
 _MOST_RUNS = 8  # of actions that are listed by their frames
@@ -58,7 +60,7 @@ class BodyJob(NamedTuple):
 
 @runtime_checkable
 class DrawnVideos(Protocol):
-    """Declares the videos of all cameras, and how a body is drawn into them."""
+    """Declares the videos of all cameras, and how bodies are drawn into them."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -79,8 +81,8 @@ class DrawnVideos(Protocol):
         """Read the frames of all cameras."""
         ...
 
-    def drawn(self, poses: "BodyTrack", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the body."""
+    def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
+        """Return the images of frame t of all cameras with the bodies that are there."""
         ...
 
 
@@ -188,11 +190,12 @@ class Recordings:
             for source in sources:
                 source.close()
 
-    def drawn(self, poses: "BodyTrack", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the body and the outline."""
+    def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
+        """Return the images of frame t of all cameras with the one body and the outline."""
         from torchpose.video._overlay import draw_body
         from torchpose.whole_body._silhouettes.rendering import render
 
+        (poses,) = people
         k, rig = t - poses.first_frame, self.rig
         height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
         model = render(poses.body, poses.state[k], rig, height, width)
@@ -268,14 +271,27 @@ def _overlay_name(camera: str) -> str:
     return f"overlay_{camera}.mp4"
 
 
-def write_poses(job: BodyJob, out: Path, poses: "BodyTrack") -> list[Path]:
+def person_suffix(place: int) -> str:
+    """Return what follows the names of the files of a person, counted from 0; nothing for the first."""
+    return "" if place == 0 else f"_p{place + 1:02d}"
+
+
+def write_people(job: BodyJob, out: Path, people: "Sequence[BodyTrack]") -> list[Path]:
+    """Write the poses of everybody: body.npz and so on of the first, body_p02.npz of the second."""
+    written = []
+    for place, poses in enumerate(people):
+        written += _write_poses(job, out, poses, person_suffix(place))
+    return written
+
+
+def _write_poses(job: BodyJob, out: Path, poses: "BodyTrack", suffix: str) -> list[Path]:
     """Write the poses as an .npz, as a table, and in the formats of other programs."""
-    written = [out / name for name in _POSES]
+    files = [out / name for name in (*_POSES, *_exports(job))]
+    written = [file.with_stem(file.stem + suffix) for file in files]
     poses.save(written[0])
     _write_csv(written[1], poses)
-    for name in _exports(job):
-        poses.export(out / name, up=job.up)
-        written.append(out / name)
+    for file in written[2:]:
+        poses.export(file, up=job.up)
     return written
 
 
@@ -294,16 +310,23 @@ def _write_csv(path: Path, poses: "BodyTrack") -> None:
             stream.write(",".join(cells) + "\n")
 
 
+def _span(people: "Sequence[BodyTrack]") -> tuple[int, int]:
+    """Return the first frame with somebody, and the one after the last."""
+    first = min(poses.first_frame for poses in people)
+    return first, max(poses.first_frame + len(poses) for poses in people)
+
+
 def draw(
-    films: DrawnVideos, poses: "BodyTrack", out: Path, videos: bool, picture: bool
+    films: DrawnVideos, people: "Sequence[BodyTrack]", out: Path, videos: bool, picture: bool
 ) -> list[Path]:
-    """Draw the body into the frames of every camera: videos, and some frames as one picture."""
+    """Draw all bodies into the frames of every camera: videos, and some frames as one picture."""
     from contextlib import ExitStack
 
     from torchpose.video._writer import VideoWriter
 
     files = [out / _overlay_name(name) for name in films.names] if videos else []
-    chosen = {round(i * (len(poses) - 1) / 5) + poses.first_frame for i in range(6)}
+    first, end = _span(people)
+    chosen = {round(i * (end - first - 1) / 5) + first for i in range(6)}
     strip: list[list[Any]] = []
     with ExitStack() as stack:
         writers = [
@@ -311,11 +334,11 @@ def draw(
             for file, size in zip(files, films.sizes, strict=False)
         ]
         for t, images in enumerate(films.images()):
-            if t < poses.first_frame or t - poses.first_frame >= len(poses):
+            if not first <= t < end:
                 continue
             if not videos and t not in chosen:
                 continue
-            drawn = films.drawn(poses, t, images)
+            drawn = films.drawn(people, t, images)
             for writer, image in zip(writers, drawn, strict=False):
                 writer.write(image)
             if t in chosen:
@@ -415,37 +438,60 @@ def action_text(poses: "BodyTrack") -> str:
 
 
 def write_page(
-    camera: "PinholeCamera", poses: "BodyTrack", facts: dict[str, str], out: Path
+    camera: "PinholeCamera", people: "Sequence[BodyTrack]", facts: dict[str, str], out: Path
 ) -> list[Path]:
-    """Write the page with the first camera's overlay, if there is one, the skeleton and curves."""
+    """Write the page with the first camera's overlay, if there is one, the skeletons and curves."""
     from torchpose.viz._report.page import write_report
 
     overlay = out / _overlay_name(camera.name)
-    bones = [(p, j) for j, p in enumerate(poses.body.skeleton.parents) if p >= 0]
+    bones = [(p, j) for j, p in enumerate(people[0].body.skeleton.parents) if p >= 0]
+    first, end = _span(people)
     page = write_report(
-        out / "report.html", [poses.seen_by(camera)], overlay=overlay if overlay.exists() else None,
-        title="Tracked body", facts=facts, notes=poses.notes,
-        n_frames=len(poses), limbs=bones,
+        out / "report.html", [poses.seen_by(camera) for poses in people],
+        overlay=overlay if overlay.exists() else None,
+        title="Tracked body" if len(people) == 1 else "Tracked bodies", facts=facts,
+        notes=_notes_of(people), first_frames=[poses.first_frame - first for poses in people],
+        n_frames=end - first, limbs=bones,
     )  # fmt: skip
     return [page]
 
 
+def _notes_of(people: "Sequence[BodyTrack]") -> list[str]:
+    """Return the notes that all persons have, and those of single ones."""
+    shared = [note for note in people[0].notes if all(note in one.notes for one in people)]
+    own = [
+        f"person {place}: {note}"
+        for place, one in enumerate(people, 1)
+        for note in one.notes
+        if note not in shared
+    ]
+    return shared + own
+
+
 def summary(
-    poses: "BodyTrack", facts: dict[str, str], written: Sequence[Path], notes: Sequence[str] = ()
+    people: "Sequence[BodyTrack]",
+    facts: dict[str, str],
+    written: Sequence[Path],
+    notes: Sequence[str] = (),
 ) -> int:
-    """Print what was found; return 1 if the person was lost in more than half of the frames, else 0."""
+    """Print what was found; return 1 if persons were lost in more than half of their frames, else 0."""
     for name, fact in facts.items():
         print(f"{name:<12} {fact}")
-    print(f"{'frames':<12} {len(poses)} from frame {poses.first_frame}")
-    coasting, respread = int(poses.coasting.sum()), int(poses.respread.sum())
+    if len(people) == 1:
+        print(f"{'frames':<12} {len(people[0])} from frame {people[0].first_frame}")
+    for place, poses in enumerate(people if len(people) > 1 else (), 1):
+        last = poses.first_frame + len(poses) - 1
+        print(f"{f'person {place}':<12} frames {poses.first_frame} to {last}")
+    coasting = sum(int(poses.coasting.sum()) for poses in people)
+    respread = sum(int(poses.respread.sum()) for poses in people)
     if coasting:
         print(f"{'unseen':<12} {coasting} frames, in which the pose is a prediction")
     if respread:
         print(f"{'lost':<12} {respread} frames, in which the search began anew")
-    for note in (*poses.notes, *notes):
+    for note in (*_notes_of(people), *notes):
         print(f"{'note':<12} {note}")
     print(f"{'written':<12} " + ", ".join(map(str, written)))
-    if 2 * (coasting + respread) <= len(poses):
+    if 2 * (coasting + respread) <= sum(map(len, people)):
         return 0
     print("torchpose: the person was lost in more than half of the frames", file=sys.stderr)
     return 1

@@ -49,6 +49,7 @@ class Keypoints:
         neck: kind of neck if the joint set or the file tells, see `torchpose.skeleton`.
         path: the file or folder.
         notes: sentences on conversions of the file's keypoints.
+        n_people: how many people are in each frame [T], of whom one is followed; None if the file holds one.
     """
 
     keypoints: Tensor
@@ -60,6 +61,7 @@ class Keypoints:
     neck: str | None = None
     path: Path | None = None
     notes: tuple[str, ...] = ()
+    n_people: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -104,8 +106,8 @@ def read_keypoints(path: str | Path) -> Keypoints:
 
 def _read(path: Path) -> RawKeypoints:
     if os.path.isdir(path):
-        points, confidence, names = read_openpose(path)
-        return RawKeypoints(points, names, confidence)
+        points, confidence, names, n_people = read_openpose(path)
+        return RawKeypoints(points, names, confidence, n_people=n_people)
     path = require_file(path)
     readers = {".npz": read_npz_keypoints, ".csv": read_csv_keypoints}
     if path.suffix.lower() not in readers:
@@ -209,6 +211,7 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         None if raw.confidence is None else torch.from_numpy(confidence), fps,
         _check_matrix(path, raw.K), _check_size(path, raw.image_size),
         raw.neck or (None if skeleton is None else skeleton.neck), path,
+        n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
     )  # fmt: skip
     return _with_joints(keypoints) if lacks_joints(names) else keypoints
 

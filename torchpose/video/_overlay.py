@@ -290,6 +290,7 @@ def draw_body(
     silhouette: Bool[Tensor, "h w"] | None = None,
     keypoints: Float[Tensor, "K 2"] | None = None,
     label: str = "",
+    tint: int | None = None,
 ) -> Image:
     """Return a copy of a frame with a body, its silhouette and what was measured drawn on it.
 
@@ -303,6 +304,7 @@ def draw_body(
         model, silhouette: of the image at any scale [h, w]. keypoints: pixels of that image, NaN where
             there is none.
         label: a word or two over the head; ASCII.
+        tint: index into `PERSON_TINTS`, of the trunk, the head and the label; by default they are white.
 
     Returns:
         A new image of the same size.
@@ -318,7 +320,8 @@ def draw_body(
         _tint(canvas, model, _MODEL)
     if silhouette is not None:
         _contour(canvas, silhouette, _MEASURED, pen.edge + 1)
-    points, colors = joints2d.tolist(), _joint_colors(tuple(skeleton.names), _MIDDLE)
+    own = _MIDDLE if tint is None else rgb(PERSON_TINTS[tint % len(PERSON_TINTS)])
+    points, colors = joints2d.tolist(), _joint_colors(tuple(skeleton.names), own)
     for joint, parent in enumerate(skeleton.parents):
         if parent >= 0:
             pen.bone(points[parent], points[joint], colors[joint])
@@ -327,7 +330,7 @@ def draw_body(
     for point in [] if keypoints is None else keypoints.tolist():
         pen.cross(point, _MEASURED)
     pen.label(label, points, skeleton.names.index("head") if "head" in skeleton.names else 0,
-              _MIDDLE)  # fmt: skip
+              own)  # fmt: skip
     return canvas
 
 

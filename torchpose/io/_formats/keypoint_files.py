@@ -35,6 +35,7 @@ class RawKeypoints:
     K: np.ndarray | None = None
     image_size: np.ndarray | Sequence[float] | None = None
     neck: str | None = None
+    n_people: np.ndarray | None = None
 
 
 def read_npz_keypoints(path: Path) -> RawKeypoints:

@@ -7,6 +7,7 @@ confidence. An empty list of people is a frame without measurements.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from torchpose._core.reading import check_span, read_json, reading
 from torchpose.errors import FileFormatError, InputError
 from torchpose.skeleton._joint_sets import SKELETONS
 
-__all__ = ["read_openpose"]
+__all__ = ["read_openpose", "read_openpose_people"]
 
 _SUFFIX = "_keypoints.json"
 _LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
@@ -30,8 +31,10 @@ _EXPECTED = "OpenPose's JSON with people / pose_keypoints_2d"
 _FAR = 1e9  # pixels; no keypoint is there
 
 
-def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Read a folder of OpenPose JSON files.
+def read_openpose(
+    folder: str | Path,
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
+    """Read a folder of OpenPose JSON files, and follow one person.
 
     The number in front of ``_keypoints.json`` is the frame; frames without a file are missing.
 
@@ -40,34 +43,73 @@ def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str
 
     Returns:
         keypoints [T, J, 2], pixels, NaN where missing; confidence [T, J]; the J names of BODY_25,
-        BODY_25B or COCO 18, whichever the files hold. BODY_25B has as many keypoints as BODY_25 in another
-        order; where the necks and hips are tells which it is.
+        BODY_25B or COCO 18, whichever the files hold; how many people are in each frame [T]. BODY_25B has as
+        many keypoints as BODY_25 in another order; where the necks and hips are tells which it is.
 
     Raises:
         InputError: no such files, or nobody in any of them. FileFormatError: not OpenPose's JSON,
             or another number of keypoints; the file is named.
     """
+    frames, names = _read_frames(folder)
+    table = np.zeros((len(frames), len(names), 3))
+    followed = None
+    for row, group in enumerate(frames):
+        if group:
+            followed = _pick(np.stack(group), followed)
+            table[row] = followed
+    return *_measured(table), names, np.array([len(group) for group in frames])
+
+
+def read_openpose_people(
+    folder: str | Path,
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Read the keypoints of everybody in a folder of OpenPose JSON files.
+
+    Args:
+        folder: the folder.
+
+    Returns:
+        keypoints [T, D, J, 2] of the up to D people of each frame, in the order of the file, NaN where there
+        are fewer; confidence [T, D, J]; the J names. An index says nothing about who it is.
+
+    Raises:
+        InputError, FileFormatError: as `read_openpose`.
+    """
+    frames, names = _read_frames(folder)
+    table = np.zeros((len(frames), max(map(len, frames)), len(names), 3))
+    for row, group in enumerate(frames):
+        if group:
+            table[row, : len(group)] = np.stack(group)
+    return *_measured(table), names
+
+
+def _read_frames(folder: str | Path) -> tuple[list[list[np.ndarray]], tuple[str, ...]]:
+    """Return the keypoints [J, 3] of the people of every frame, and the J names."""
     files = _files_by_frame(Path(folder))
     people = {frame: _people(path) for frame, path in files.items()}
-    sizes = {len(person) for group in people.values() for person in group}
+    everybody = [person for group in people.values() for person in group]
+    names = _layout(folder, everybody, len(files))
+    return [people.get(frame, []) for frame in range(min(files), max(files) + 1)], names
+
+
+def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) -> tuple[str, ...]:
+    """Return the names of the keypoints."""
+    sizes = {len(person) for person in everybody}
     if not sizes:
-        raise InputError(f"{folder}: nobody was found in any of {len(files)} frames")
+        raise InputError(f"{folder}: nobody was found in any of {n_frames} frames")
     if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
         raise FileFormatError(
             f"{folder}: expected 25 keypoints (BODY_25 or BODY_25B) or 18 (COCO) for everybody, got "
             f"{', '.join(map(str, sorted(sizes)))}"
         )
-    everybody = np.stack([person for group in people.values() for person in group])
-    names = _BODY_25B if _is_body_25b(everybody) else _LAYOUTS[everybody.shape[1]]
-    first, last = min(files), max(files)
-    table = np.zeros((last - first + 1, len(names), 3))
-    followed = None
-    for frame in sorted(people):
-        if people[frame]:
-            followed = _pick(np.stack(people[frame]), followed)
-            table[frame - first] = followed
+    stacked = np.stack(everybody)
+    return _BODY_25B if _is_body_25b(stacked) else _LAYOUTS[stacked.shape[1]]
+
+
+def _measured(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return keypoints [..., 2], NaN where missing, and confidence [...] of a table [..., 3]."""
     confidence = table[..., 2].clip(max=1.0)  # a peak of the heat map, which may exceed 1
-    return np.where(confidence[..., None] > 0, table[..., :2], np.nan), confidence, names
+    return np.where(confidence[..., None] > 0, table[..., :2], np.nan), confidence
 
 
 def _files_by_frame(folder: Path) -> dict[int, Path]:

@@ -1,0 +1,1 @@
+"""Several bodies from keypoints in calibrated cameras."""
