@@ -39,6 +39,7 @@ def main(
     data: Path,
     threads: int = 1,
     out: TableFile | None = None,
+    seed: int = 0,
     choose: bool = False,
     quick: bool = False,
 ) -> None:
@@ -48,18 +49,19 @@ def main(
         data: folder with the sets.
         threads: cores.
         out: file for the same as Markdown, or a folder.
+        seed: of cameras and faults.
         choose: the clips on which constants are chosen, in place of those that are scored.
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
     report = Report("Several persons")
     groups = CHOOSING if choose else SCORED
-    clips = [meet(data, group) for group in (groups[:1] if quick else groups)]
+    clips = [meet(data, group, seed) for group in (groups[:1] if quick else groups)]
     for count, title in _WORDS.items():
         chosen = [clip for clip in clips if clip.joints.shape[1] == count]
         if chosen:
             _add_table(report, title, chosen)
-    _add_times(report, meet(data, QUARTET, frames=_TIMED_FRAMES))
+    _add_times(report, meet(data, QUARTET, seed, frames=_TIMED_FRAMES))
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
     if out is not None:
@@ -87,7 +89,7 @@ def _add_table(report: Report, title: str, clips: Sequence[People]) -> None:
 def _add_times(report: Report, clip: People) -> None:
     table = report.table(
         "time", "Time for a frame", ["1 person", "2 persons", "4 persons"], digits=(2, 2, 2),
-        note=f"Filtered, {_TIMED_FRAMES} frames, one core, the least of three runs.",
+        note=f"Filtered, {_TIMED_FRAMES} frames, least of three runs; ratio to one person.",
     )  # fmt: skip
     for n in (4, 2):
         taken = [milliseconds(clip.of_cameras(n), count) for count in tqdm(_TIMED, desc="time")]

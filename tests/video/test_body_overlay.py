@@ -4,7 +4,7 @@ import torch
 
 from torchpose.body import BODY_15
 from torchpose.errors import InputError, ShapeError
-from torchpose.video._overlay import draw_body
+from torchpose.video._overlay import PERSON_TINTS, draw_body, rgb
 
 
 def joints():
@@ -26,6 +26,15 @@ def test_sides_have_their_colours_and_the_frame_stays():
     left, right = drawn[100, 100].astype(int), drawn[100, 60].astype(int)
     assert left[2] > left[0] + 80  # blue
     assert right[0] > right[2] + 80  # orange
+
+
+def test_trunk_and_head_have_the_tint_of_the_person():
+    frame = np.full((120, 160, 3), 90, np.uint8)
+    heads = [draw_body(frame, joints(), tint=tint)[20, 80].tolist() for tint in (0, 1, 6)]
+    assert heads == [list(rgb(PERSON_TINTS[0])), *[list(rgb(PERSON_TINTS[1]))] * 2]
+    assert (
+        draw_body(frame, joints(), tint=1)[100, 100] == draw_body(frame, joints())[100, 100]
+    ).all()
 
 
 def test_silhouettes_of_another_scale_cover_their_place():
