@@ -21,7 +21,7 @@ from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._window import WindowLayout, WindowPrior
+from torchpose.priors._window import WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._estimator import (
