@@ -4,7 +4,7 @@
 
 Head, neck and hands of the performer of `torchpose.demo` with 3 px of noise, tracked frame by frame by the
 default tracker of the prior that comes with torchpose, beside the paper's filter. Steps are timed one by one
-after the first frames. Confidence that differs in every frame gives each frame a measurement noise of its own.
+after the first frames. Confidence that differs in every frame gives each frame a noise of its own.
 """
 
 import statistics

@@ -220,8 +220,8 @@ def step_memoryless(
     if not values_visible():
         (group,) = _groups(model, frames, len(frame.z))
         shared = measured_parts(model)
-        values = _estimate(model, rule, medians, group, None, shared, return_cov)
-        return later, StepOutput(*values[:-1])
+        found = _estimate(model, rule, medians, group, None, shared, return_cov)
+        return later, StepOutput(*found[:-1])
     out = run_memoryless(model, rule, medians, frames, return_cov)
     values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
     first = (None if value is None else value[:, 0] for value in values)
