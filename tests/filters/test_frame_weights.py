@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from tests.filters.oracles import random_covariance, random_mixture, tensor
 from torchpose.errors import InputError
 from torchpose.filters import MixtureKalmanFilter, _memoryless
-from torchpose.filters._memoryless import frame_evidence
+from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.math._gaussian import kalman_gain
 from torchpose.priors import GaussianMixture
 
@@ -183,15 +183,24 @@ def test_gradients_of_many_frames_without_memory_reach_prior_and_noise(kind):
     assert torch.autograd.gradcheck(total, leaves, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
-def test_the_evidence_alone_is_that_of_the_estimates():
+@pytest.mark.parametrize("own_noise", [False, True])
+def test_wanted_dimensions_and_the_context_are_those_of_whole_filters(own_noise):
     model, z, mask = problem()
+    z, mask = tensor(z), torch.as_tensor(mask)
     own = tensor([[0.5 + 0.1 * t for t in range(7)]] * 3)[..., None, None] * torch.eye(3)
-    for noise in (None, own.double()):
-        filter_ = make_filter(model, gamma=0.0)
-        frames = filter_.check(tensor(z), torch.as_tensor(mask), noise, None, None)
-        found = frame_evidence(filter_, filter_.weight_rule, frames)
-        expected = filter_(tensor(z), torch.as_tensor(mask), noise).log_evidence
-        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    noise = own.double() if own_noise else None
+    filter_ = make_filter(model, gamma=0.0)
+    frames = filter_.check(z, mask, noise, None, None)
+    columns, given = [2, 0], (filter_.weight_rule, filter_.medians, frames, True)
+    out, context = run_with_context(filter_, *given, Wanted(tuple(columns), 2))
+    whole = filter_(z, mask, noise, return_cov=True)
+    torch.testing.assert_close(out.mean, whole.mean[..., columns], rtol=1e-12, atol=1e-12)
+    covs = whole.cov[..., columns, :][..., columns]
+    torch.testing.assert_close(out.cov, covs, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(out.log_evidence, whole.log_evidence, rtol=1e-12, atol=1e-12)
+    first = mask & torch.tensor([True, True, False])
+    expected = filter_(z, first, noise).log_evidence
+    torch.testing.assert_close(context, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_gains_are_made_for_a_noise_that_comes_again(monkeypatch):

@@ -30,6 +30,7 @@ __all__ = [
     "OwnFrames",
     "condition_own",
     "frame_noise",
+    "log_normaliser",
     "measured_parts",
     "own_moments",
 ]
@@ -63,11 +64,18 @@ def frame_noise(cov: Float[Tensor, "*#frames Z Z"], mask: Bool[Tensor, "*frames 
 
 
 class MeasuredParts(NamedTuple):
-    """Holds what no R changes: H mu [K, Z], A = H Sigma [K, Z, D] and C = H Sigma H^T [K, Z, Z]."""
+    """Holds what no R changes, with means, covariances and A of the dimensions that are wanted.
+
+    Attributes:
+        centre: H mu [K, Z]. rows: A = H Sigma [K, Z, D]. block: C = H Sigma H^T [K, Z, Z].
+        means, covs: mu [K, D] and Sigma [K, D, D].
+    """
 
     centre: Tensor
     rows: Tensor
     block: Tensor
+    means: Tensor
+    covs: Tensor
 
 
 class OwnFrames(NamedTuple):
@@ -75,7 +83,8 @@ class OwnFrames(NamedTuple):
 
     Attributes:
         factor: L [N, K, Z, Z]; a missing measurement has the row and column of the identity.
-        white: v [N, K, Z], 0 where missing. log_likelihood: [N, K].
+        white: v [N, K, Z], 0 where missing. log_likelihood: [N, K]. log_context: that of the first
+            measurements alone [N, K], or None.
         jitter: of the S [N, K], or None; see `mended_cholesky`. mask: [N, Z], True where measured.
     """
 
@@ -84,6 +93,7 @@ class OwnFrames(NamedTuple):
     log_likelihood: Tensor
     jitter: Tensor | None
     mask: Tensor
+    log_context: Tensor | None = None
 
 
 def condition_own(
@@ -92,21 +102,40 @@ def condition_own(
     z: Float[Tensor, "N Z"],
     mask: Bool[Tensor, "N Z"],
     noise: Float[Tensor, "N Z Z"],
+    n_context: int = 0,
 ) -> OwnFrames:
     """Return the innovations and likelihoods of all components for frames with an R of their own.
 
     Args:
         parts: from `measured_parts`. z: 0 where missing. mask: True where measured. noise: R.
+        n_context: the number of the first measurements whose likelihood is wanted too; 0 is none.
     """
     noise, both = _own_noise(noise, mask)
     factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
-    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    log_norm = -0.5 * LOG_2PI * mask.sum(-1, keepdim=True).to(log_det) - log_det
-    factor = factor.to(model.dtype)
+    log_norm = log_normaliser(factor, mask[:, None])
+    own_factor, factor = factor, factor.to(model.dtype)
     residual = (z[:, None] - parts.centre.to(model.dtype)) * mask[:, None]
     white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
-    log_likelihood = log_norm.to(model.dtype) - 0.5 * white.square().sum(-1)
-    return OwnFrames(factor, white, log_likelihood, jitter, mask)
+    squared = white.square()
+    log_likelihood = log_norm.to(model.dtype) - 0.5 * squared.sum(-1)
+    log_context = None
+    if n_context:
+        log_norm = log_normaliser(own_factor, mask[:, None], n_context)
+        log_context = log_norm.to(model.dtype) - 0.5 * squared[..., :n_context].sum(-1)
+    return OwnFrames(factor, white, log_likelihood, jitter, mask, log_context)
+
+
+def log_normaliser(
+    factor: Float[Tensor, "*batch Z Z"], mask: Bool[Tensor, "*#batch Z"], count: int | None = None
+) -> Float[Tensor, "*batch"]:
+    """Return -1/2 log det(2 pi S) of the first measured dimensions, of S = L L^T.
+
+    Args:
+        factor: L, with the rows of the identity where nothing is measured. mask: True where measured.
+        count: the number of the first dimensions; None is all.
+    """
+    scale = factor.diagonal(dim1=-2, dim2=-1)[..., :count]
+    return -0.5 * LOG_2PI * mask[..., :count].sum(-1).to(scale) - scale.log().sum(-1)
 
 
 def _own_noise(
@@ -133,30 +162,40 @@ def own_moments(
         medians: first of three dimensions each, points that are estimated by their geometric median.
     """
     weights = log_weights.exp()
-    rows, centres = parts.rows.to(model.dtype), model.means.to(model.dtype)
+    rows, centres = parts.rows.to(model.dtype), parts.means.to(model.dtype)
     solved = torch.linalg.solve_triangular(frames.factor.mT, frames.white[..., None], upper=True)
     gained = (weights[..., None] * solved[..., 0]).flatten(1)
     mean = weights @ centres + gained @ rows.flatten(0, 1)
     total = None
     if return_cov:
-        total = _covariance(model, rows, frames, weights, solved[..., 0], mean)
+        total = _covariance(parts, rows, frames, weights, solved[..., 0], mean)
     if not len(medians):
         return mean, total
     columns = median_columns(medians)
-    off = _median_offset(model, rows, frames, weights, solved[..., 0], mean, columns)
+    off = _median_offset(parts, rows, frames, weights, solved[..., 0], mean, columns)
     return mean - off, None if total is None else total + off[:, :, None] * off[:, None]
 
 
-def measured_parts(model: MixtureKalmanFilter) -> MeasuredParts:
-    """Return what no R changes, kept while the mixture stays as it is."""
+def measured_parts(
+    model: MixtureKalmanFilter, wanted: tuple[int, ...] | None = None
+) -> MeasuredParts:
+    """Return what no R changes, kept while the mixture stays as it is.
+
+    Args:
+        wanted: the state dimensions that are estimated; None is all.
+    """
 
     def make() -> MeasuredParts:
-        rows = model.covariances.index_select(-2, model.observed)
-        return MeasuredParts(
-            model.means[:, model.observed], rows, rows.index_select(-1, model.observed)
-        )
+        means, covs = model.means, model.covariances
+        rows = covs.index_select(-2, model.observed)
+        block = rows.index_select(-1, model.observed)
+        if wanted is not None:
+            columns = torch.tensor(wanted, device=means.device)
+            rows, means = rows.index_select(-1, columns), means[:, columns]
+            covs = covs[:, columns[:, None], columns]
+        return MeasuredParts(model.means[:, model.observed], rows, block, means, covs)
 
-    return derived(model, "measured parts", (model.means, model.covariances), make)
+    return derived(model, ("measured parts", wanted), (model.means, model.covariances), make)
 
 
 def _moved(solved: Float[Tensor, "N K Z"], rows: Float[Tensor, "K Z C"]) -> Float[Tensor, "N K C"]:
@@ -165,7 +204,7 @@ def _moved(solved: Float[Tensor, "N K Z"], rows: Float[Tensor, "K Z C"]) -> Floa
 
 
 def _covariance(
-    model: MixtureKalmanFilter,
+    parts: MeasuredParts,
     rows: Tensor,
     frames: OwnFrames,
     weights: Tensor,
@@ -173,9 +212,9 @@ def _covariance(
     mean: Tensor,
 ) -> Float[Tensor, "N D D"]:
     """Return sum_j w_j (Sigma_j + (m_j - m)(m_j - m)^T) - sum_j w_j W_j^T W_j."""
-    apart = model.means.to(model.dtype) - mean[:, None] + _moved(solved, rows)
+    apart = parts.means.to(rows) - mean[:, None] + _moved(solved, rows)
     apart = apart * weights[..., None].sqrt()
-    prior = weights @ model.covariances.to(model.dtype).flatten(1)
+    prior = weights @ parts.covs.to(rows).flatten(1)
     explained = _explained(frames.factor, rows, weights, frames.mask)
     return prior.unflatten(-1, rows.shape[-1:] * 2) + apart.mT @ apart - explained
 
@@ -202,7 +241,7 @@ def _explained(
 
 
 def _median_offset(
-    model: MixtureKalmanFilter,
+    parts: MeasuredParts,
     rows: Tensor,
     frames: OwnFrames,
     weights: Tensor,
@@ -212,10 +251,10 @@ def _median_offset(
 ) -> Float[Tensor, "N D"]:
     """Return what the means exceed the geometric medians by, 0 in all but these columns."""
     rows = rows[..., columns]
-    means = model.means[:, columns].to(model.dtype) + _moved(solved, rows)
+    means = parts.means[:, columns].to(rows) + _moved(solved, rows)
     seen = rows * frames.mask[:, None, :, None]
     white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)
-    prior = model.covariances.diagonal(dim1=-2, dim2=-1)[:, columns].to(model.dtype)
+    prior = parts.covs.diagonal(dim1=-2, dim2=-1)[:, columns].to(rows)
     spread = (prior - white.square().sum(-2)).unflatten(-1, (-1, 3)).sum(-1)
     points, start = (x.unflatten(-1, (-1, 3)) for x in (means, mean[:, columns]))
     found = geometric_median(weights, points, spread, start).flatten(-2)

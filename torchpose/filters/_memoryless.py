@@ -18,7 +18,9 @@ from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.value_checks import values_visible
 from torchpose.filters._frame_noise import (
     MeasuredParts,
+    OwnFrames,
     condition_own,
+    log_normaliser,
     measured_parts,
     own_moments,
 )
@@ -26,15 +28,16 @@ from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
 from torchpose.filters._recompute import recomputed, wants_gradient
-from torchpose.filters._weights import WeightRule, estimate_of, frame_weights
+from torchpose.filters._weights import WeightRule, estimate_of, frame_weights, normalise
 from torchpose.math._gaussian import Gain, kalman_gain
 from torchpose.math._geometric_median import median_estimate
 
 __all__ = [
+    "Wanted",
     "conditioned_groups",
-    "frame_evidence",
     "frame_log_likelihood",
     "run_memoryless",
+    "run_with_context",
     "step_memoryless",
 ]
 
@@ -59,15 +62,19 @@ def frame_log_likelihood(
     return _in_order(found).unflatten(0, frames.z.shape[:2])
 
 
-def frame_evidence(
-    model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
-) -> Float[Tensor, "B T"]:
-    """Return the log-evidence of every frame by `run_memoryless`, without estimates."""
-    groups = _groups(model, frames, _SHARED_FRAMES)
-    found = [
-        (group.rows, _weighed(rule, group, _log_likelihood(model, group))[1]) for group in groups
-    ]
-    return _in_order(found).unflatten(0, frames.z.shape[:2])
+class Wanted(NamedTuple):
+    """Results that are wanted of frames.
+
+    Attributes:
+        columns: the state dimensions that are estimated, in this order; None is all.
+        n_context: the number of the first measurements whose evidence is wanted by itself.
+    """
+
+    columns: tuple[int, ...] | None = None
+    n_context: int = 0
+
+
+_ALL = Wanted()
 
 
 def conditioned_groups(
@@ -85,9 +92,9 @@ def conditioned_groups(
         own_noise = frames.cov if noise is None else noise[same[0]]
         for rows in same.split(_RECOMPUTED_FRAMES):
             group = _Group(rows, z[rows], mask[same[0]], own_noise)
-            gain, covs = _gain(model, group)
-            means, log_likelihood, _ = _condition(model, measured_parts(model), group, gain)
-            yield group, means, covs, _weighed(rule, group, log_likelihood)[0]
+            shared = _gain(model, group, _ALL)
+            given = _condition(model, measured_parts(model), group, shared)
+            yield group, given.means, shared.covs, _weighed(rule, group, given.log_likelihood)[0]
 
 
 def run_memoryless(
@@ -105,16 +112,38 @@ def run_memoryless(
             the points that are estimated by their geometric medians. frames: all that is measured.
         return_cov: whether to return covariances. progress: whether to show a progress bar.
     """
+    return run_with_context(model, rule, medians, frames, return_cov, _ALL, progress)[0]
+
+
+def run_with_context(
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
+    frames: Measurements,
+    return_cov: bool,
+    wanted: Wanted,
+    progress: bool = False,
+) -> tuple[FilterOutput, Float[Tensor, "B T"] | None]:
+    """Return what `run_memoryless` does, of the wanted dimensions, and the evidence of a context.
+
+    The context are the first measurements. With S = L L^T their likelihood is that of the first innovations
+    over their standard deviations, so that it takes no filter of its own.
+
+    Args:
+        model, rule, frames, return_cov, progress: as `run_memoryless`. medians: among the wanted dimensions.
+        wanted: the dimensions and the context.
+    """
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
-    parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
-    shared = measured_parts(model)
+    parts: list[list[tuple[Tensor, Tensor]]] = [[] for _ in range(7)]
+    shared = measured_parts(model, wanted.columns)
+    at_a_time = _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES
     # a bar that shows nothing would still keep torch.compile out
     bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
-    for group in _groups(model, frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
+    for group in _groups(model, frames, at_a_time, wanted):
         # Gains and parts that groups share are not among what a gradient computes anew for one of them.
-        gain = _gain(model, group) if group.shares_gain else None
-        arguments = model, rule, medians, group, gain, shared, return_cov
+        gain = _gain(model, group, wanted) if group.shares_gain else None
+        arguments = model, rule, medians, group, gain, shared, return_cov, wanted.n_context
         values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
         for part, value in zip(parts, values, strict=True):
             if value is not None:
@@ -127,8 +156,9 @@ def run_memoryless(
         _in_order(part).unflatten(0, (batch, n_frames)) for part in parts[:3]
     )
     covs = _in_order(parts[3]).unflatten(0, (batch, n_frames)) if return_cov else None
-    work = Mending(*(_in_order(part).unflatten(0, (batch, n_frames)) for part in parts[4:]))
-    return finish_output(mean, log_weights, evidence, covs, frames.lengths, work)
+    work = Mending(*(_in_order(part).unflatten(0, (batch, n_frames)) for part in parts[4:6]))
+    context = _in_order(parts[6]).unflatten(0, (batch, n_frames)) if wanted.n_context else None
+    return finish_output(mean, log_weights, evidence, covs, frames.lengths, work), context
 
 
 def _estimate(
@@ -136,24 +166,36 @@ def _estimate(
     rule: WeightRule,
     medians: Tensor,
     group: "_Group",
-    gain: tuple[Gain, Tensor] | None,
+    gain: "_SharedGain | None",
     shared: MeasuredParts,
     return_cov: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
-    """Return estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
+    n_context: int = 0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Tensor | None]:
+    """Return the estimates of a group of frames.
+
+    They are means, log-weights, log-evidence, covariances, both parts of the mending, and the log-evidence
+    of the context.
+    """
+    given: OwnFrames | _Conditioned
     if gain is None:
-        own = condition_own(model, shared, group.z, group.mask, group.noise)
-        log_likelihood, jitter = own.log_likelihood, own.jitter
+        given = own = condition_own(model, shared, group.z, group.mask, group.noise, n_context)
     else:
-        means, log_likelihood, jitter = _condition(model, shared, group, gain[0])
-    log_weights, evidence = _weighed(rule, group, log_likelihood)
+        given = tracks = _condition(model, shared, group, gain, n_context)
+    log_weights, evidence = _weighed(rule, group, given.log_likelihood)
     if gain is None:
         mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
     else:
-        mean, total = estimate_of(log_weights, means, gain[1] if return_cov else None)
+        mean, total = estimate_of(log_weights, tracks.means, gain.covs if return_cov else None)
         if len(medians):
-            mean, total = median_estimate(log_weights, means, gain[1], mean, total, medians)
-    return mean, log_weights, evidence, total, *mending(mean, jitter)
+            mean, total = median_estimate(
+                log_weights, tracks.means, gain.covs, mean, total, medians
+            )
+    context = None
+    if given.log_context is not None:
+        there = group.mask[..., :n_context].any(-1)
+        both = torch.logsumexp(normalise(rule.log_prior) + given.log_context, -1)
+        context = torch.where(there, both, 0.0)
+    return mean, log_weights, evidence, total, *mending(mean, given.jitter), context
 
 
 def _weighed(
@@ -178,7 +220,8 @@ def step_memoryless(
     if not values_visible():
         (group,) = _groups(model, frames, len(frame.z))
         shared = measured_parts(model)
-        return later, StepOutput(*_estimate(model, rule, medians, group, None, shared, return_cov))
+        found = _estimate(model, rule, medians, group, None, shared, return_cov)
+        return later, StepOutput(*found[:-1])
     out = run_memoryless(model, rule, medians, frames, return_cov)
     values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
     first = (None if value is None else value[:, 0] for value in values)
@@ -204,7 +247,9 @@ class _Group(NamedTuple):
         return self.mask.ndim == 1
 
 
-def _groups(model: MixtureKalmanFilter, frames: Measurements, at_a_time: int) -> Iterator[_Group]:
+def _groups(
+    model: MixtureKalmanFilter, frames: Measurements, at_a_time: int, wanted: Wanted = _ALL
+) -> Iterator[_Group]:
     """Yield frames that measure the same dimensions with the same noise, which share their gains."""
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
@@ -213,7 +258,7 @@ def _groups(model: MixtureKalmanFilter, frames: Measurements, at_a_time: int) ->
         yield _Group(torch.arange(len(z), device=z.device), z, mask, each)
         return
     alike = _alike(mask, noise)
-    if noise is not None and not _pays(model, noise, mask, len(alike)):
+    if noise is not None and not _pays(model, noise, mask, len(alike), wanted):
         yield from _groups_of_own(z, mask, noise)
         return
     for same in alike:
@@ -236,12 +281,13 @@ def _pays(
     noise: Float[Tensor, "N Z Z"],
     mask: Bool[Tensor, "N Z"],
     n_different: int,
+    wanted: Wanted,
 ) -> bool:
     """Return whether frames with noise of their own gain by making the gains that some of them share."""
     if noise.requires_grad:
         return False
     if len(noise) == 1:
-        return _kept_gains(model).is_asked_again(noise[0], mask[0])
+        return _kept_gains(model, wanted).is_asked_again(noise[0], mask[0])
     return n_different <= len(noise) / _LEAST_SHARE
 
 
@@ -254,55 +300,96 @@ def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
 def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, "N M"]:
     shared = measured_parts(model)
     if group.shares_gain:
-        return _whitened(shared, group, _gain(model, group)[0])[1]
+        gain = _gain(model, group, _ALL).gain
+        return _log_density(gain.log_norm, _whitened(shared, group, gain))
     return condition_own(model, shared, group.z, group.mask, group.noise).log_likelihood
 
 
+class _Conditioned(NamedTuple):
+    """Holds the components given N frames that share their gains.
+
+    Attributes:
+        means: [N, M, D]. log_likelihood: [N, M]. jitter: [N, M], or None.
+        log_context: the log-likelihood of the first measurements alone, [N, M], or None.
+    """
+
+    means: Tensor
+    log_likelihood: Tensor
+    jitter: Tensor | None
+    log_context: Tensor | None
+
+
 def _condition(
-    model: MixtureKalmanFilter, shared: MeasuredParts, group: _Group, gain: Gain
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], and jitter."""
-    white, log_likelihood = _whitened(shared, group, gain)
-    means = torch.baddbmm(model.means.to(model.dtype)[:, None], white.mT, gain.white)
+    model: MixtureKalmanFilter,
+    shared: MeasuredParts,
+    group: _Group,
+    made: "_SharedGain",
+    n_context: int = 0,
+) -> _Conditioned:
+    """Return every component given each frame."""
+    gain = made.gain
+    white = _whitened(shared, group, gain)
+    means = torch.baddbmm(shared.means.to(model.dtype)[:, None], white.mT, gain.white)
     jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
-    return means.transpose(0, 1), log_likelihood, jitter
+    context = _log_density(made.context_norm, white[:, :n_context]) if n_context else None
+    likelihood = _log_density(gain.log_norm, white)
+    return _Conditioned(means.transpose(0, 1), likelihood, jitter, context)
 
 
-def _whitened(
-    shared: MeasuredParts, group: _Group, gain: Gain
-) -> tuple[Float[Tensor, "M Z N"], Float[Tensor, "N M"]]:
-    """Return the innovations over their standard deviations, and log-likelihoods."""
+def _whitened(shared: MeasuredParts, group: _Group, gain: Gain) -> Float[Tensor, "M Z N"]:
+    """Return the innovations over their standard deviations."""
     residual = (group.z[:, None] - shared.centre.to(group.z)) * group.mask
-    white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
-    return white, (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+    return torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
 
 
-def _gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
+def _log_density(
+    log_norm: Float[Tensor, " M"], white: Float[Tensor, "M Z N"]
+) -> Float[Tensor, "N M"]:
+    return (log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+
+
+class _SharedGain(NamedTuple):
+    """Holds what frames with the same noise and the same gaps share.
+
+    Attributes:
+        gain: of every component. covs: the covariances after the update, [M, D, D].
+        context_norm: the log of the normaliser of the first measurements' density, [M].
+    """
+
+    gain: Gain
+    covs: Tensor
+    context_norm: Tensor
+
+
+def _gain(model: MixtureKalmanFilter, group: _Group, wanted: Wanted) -> _SharedGain:
     """Return gain and covariance of every component for frames that share them, kept for later."""
-    kept = _kept_gains(model)
+    kept = _kept_gains(model, wanted)
     found = kept.get(group.noise, group.mask)
     if found is None:
         with outside_inference():
-            found = _make_gain(model, group)
+            found = _make_gain(model, group, wanted)
         kept.put(group.noise, group.mask, found)
     return found
 
 
-def _kept_gains(model: MixtureKalmanFilter) -> "_FrameGains":
+def _kept_gains(model: MixtureKalmanFilter, wanted: Wanted) -> "_FrameGains":
     sources = (model.means, model.covariances)
-    return derived(model, f"frame gains {model.dtype}", sources, _FrameGains)
+    return derived(model, ("frame gains", model.dtype, wanted), sources, _FrameGains)
 
 
-def _make_gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
-    gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
-    return gain.to(model.dtype), cov
+def _make_gain(model: MixtureKalmanFilter, group: _Group, wanted: Wanted) -> _SharedGain:
+    gain, covs = kalman_gain(
+        model.covariances, group.noise, model.observed, group.mask, wanted.columns
+    )
+    norm = log_normaliser(gain.factor, group.mask, wanted.n_context).to(model.dtype)
+    return _SharedGain(gain.to(model.dtype), covs, norm)
 
 
 class _FrameGains:
     """Holds the gains of the latest patterns of measured dimensions and noise, for one mixture."""
 
     def __init__(self) -> None:
-        self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
+        self._found: dict[tuple[Any, ...], _SharedGain] = {}
         self._asked: dict[tuple[Any, ...], None] = {}
 
     def is_asked_again(self, noise: Tensor, mask: Tensor) -> bool:
@@ -315,7 +402,7 @@ class _FrameGains:
         self._asked[key] = None
         return False
 
-    def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
+    def get(self, noise: Tensor, mask: Tensor) -> _SharedGain | None:
         """Return the stored gains for this pattern and noise, or None."""
         if torch.is_grad_enabled() and noise.requires_grad:
             return None
@@ -325,7 +412,7 @@ class _FrameGains:
             self._found[key] = found  # the latest one used is the last to go
         return found
 
-    def put(self, noise: Tensor, mask: Tensor, value: tuple[Gain, Tensor]) -> None:
+    def put(self, noise: Tensor, mask: Tensor, value: _SharedGain) -> None:
         """Keep a gain, unless the noise wants gradients; the pattern unused longest makes room."""
         if torch.is_grad_enabled() and noise.requires_grad:
             return

@@ -5,6 +5,7 @@ and what comes back is symmetric by construction.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -261,7 +262,8 @@ def kalman_gain(
     measurement_cov: Float[Tensor, "... Z Z"],
     observed: Int[Tensor, " Z"],
     mask: Bool[Tensor, "... Z"] | None = None,
-) -> tuple[Gain, Float[Tensor, "... D D"]]:
+    wanted: Sequence[int] | None = None,
+) -> tuple[Gain, Float[Tensor, "... C C"]]:
     """Return the gain and the updated covariance of a measurement of some state dimensions (BL 39-41).
 
     A missing dimension is taken out exactly: its row of H is zero and its row and column of the
@@ -272,11 +274,15 @@ def kalman_gain(
         measurement_cov: R [..., Z, Z].
         observed: the Z state dimensions that are measured.
         mask: [..., Z], True where measured; None means all.
+        wanted: the state dimensions whose gain and covariance are wanted; None means all.
 
     Returns:
-        The `Gain` and the covariance after the update [..., D, D].
+        The `Gain` and the covariance after the update [..., C, C], of the C wanted dimensions.
     """
     cross, factor, count, jitter = _innovation(cov, measurement_cov, observed, mask)
+    if wanted is not None:
+        rows = torch.tensor(wanted, device=cov.device)
+        cross, cov = cross.index_select(-1, rows), cov[..., rows[:, None], rows]
     white = torch.linalg.solve_triangular(factor, cross, upper=False)
     return Gain(factor, white, _log_norm(factor, count), jitter), cov - white.mT @ white
 

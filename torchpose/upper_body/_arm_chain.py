@@ -105,7 +105,8 @@ class ArmState(NamedTuple):
 class DirectionDensity:
     """Log-density of an `ArmPrior`; what does not depend on the directions is computed once.
 
-    That of each component is a quadratic polynomial of the six coordinates, so one product gives all.
+    That of each component is a quadratic polynomial of the six coordinates, so one product gives all. Its
+    terms of the upper arm alone are computed once for all forearms that are tried with it.
     """
 
     def __init__(self, prior: ArmPrior, device: torch.device | None = None) -> None:
@@ -126,18 +127,30 @@ class DirectionDensity:
         alone = torch.arange(dim + 1, device=device)
         self._first = torch.cat([first, alone])
         self._second = torch.cat([second, torch.full_like(alone, dim)])
-        self._slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
+        slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
-        self._slopes_of_all = pad(self._slopes, (0, 1))
+        self._slopes_of_all = pad(slopes, (0, 1))
         self._slopes_of_all[-1, -1] = self.broad
+        self._slopes_of_upper, self._slopes_of_lower = _by_bone(-0.5 * precision, pulled, constant)
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
 
-    def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
-        """Return log p(d_u, d_f)."""
-        parts = [self._known(rows) for rows in directions.reshape(-1, 6).split(_ROWS)]
-        known = torch.cat(parts).to(directions.dtype)
+    def __call__(
+        self, directions: Float[Tensor, "*batch 6"], lowers: int = 1
+    ) -> Float[Tensor, "*batch"]:
+        """Return log p(d_u, d_f).
+
+        Args:
+            directions: those of upper arms and forearms. lowers: the number of consecutive forearms that
+                have their upper arm in common.
+        """
+        rows = directions.reshape(-1, 6).double()
+        columns = pad(rows[::lowers, :3], (0, 1), value=1.0)
+        upper = (columns[:, :, None] * columns[:, None]).flatten(1) @ self._slopes_of_upper
+        count = max(1, _ROWS // lowers)
+        pairs = zip(upper.split(count), rows.split(count * lowers), strict=True)
+        known = torch.cat([self._known(*pair) for pair in pairs]).to(directions.dtype)
         return torch.logaddexp(known, known.new_tensor(self.broad)).view(directions.shape[:-1])
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
@@ -153,9 +166,19 @@ class DirectionDensity:
         columns = pad(rows.double(), (0, 1), value=1.0).mT.contiguous()
         return columns.index_select(0, self._first) * columns.index_select(0, self._second)
 
-    def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
-        """Return the log-density of the mixture, without its broad part; exponentials are float32."""
-        logs = self._terms(rows).mT @ self._slopes
+    def _known(
+        self, upper: Float[Tensor, "U K"], rows: Float[Tensor, "N 6"]
+    ) -> Float[Tensor, " N"]:
+        """Return the log-density of the mixture, without its broad part; exponentials are float32.
+
+        Args:
+            upper: the polynomials' terms of the upper arms alone. rows: N / U directions for each of these.
+        """
+        columns = pad(rows, (0, 1), value=1.0).mT.contiguous()
+        terms = (columns[3:6, None] * columns).flatten(0, 1)
+        logs = upper.repeat_interleave(len(rows) // len(upper), 0).addmm_(
+            terms.mT, self._slopes_of_lower
+        )
         most = logs.detach().amax(-1, keepdim=True)
         # exp of what is far below is slow where it is denormal, and adds nothing
         near = logs.sub_(most).float().clamp_min_(_NOTHING).exp_()
@@ -252,7 +275,7 @@ class ArmChain:
                 lower.ends, borders[..., :-1, :], borders[..., -1, :], log_inside[..., None, None]
             )
         weight = weight.flatten(-2)
-        prior = self.density(directions)
+        prior = self.density(directions, sizes[1])
         if weight.shape[-1] <= count:
             return Arms(directions, weight, prior)
         best = (weight + prior).topk(count, -1).indices
@@ -357,6 +380,19 @@ class ArmChain:
         """
         mean = (state.weight[..., None, :] @ state.directions)[..., 0, :].unflatten(-1, (2, 3))
         return torch.where(seen[..., None, None], normalize(mean, dim=-1), mean)
+
+
+def _by_bone(
+    square: Float[Tensor, "K 6 6"], linear: Float[Tensor, "K 6"], constant: Float[Tensor, " K"]
+) -> tuple[Float[Tensor, "16 K"], Float[Tensor, "21 K"]]:
+    """Return the coefficients of quadratic polynomials of the directions u and f of both bones.
+
+    They are those of the products of (u, 1) with itself, and of f with (u, f, 1).
+    """
+    upper = pad(square[:, :3, :3], (0, 1, 0, 1))
+    upper[:, :3, 3], upper[:, 3, 3] = linear[:, :3], constant
+    lower = torch.cat([2 * square[:, 3:, :3], square[:, 3:, 3:], linear[:, 3:, None]], -1)
+    return upper.flatten(1).mT.contiguous(), lower.flatten(1).mT.contiguous()
 
 
 def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> ArmState:

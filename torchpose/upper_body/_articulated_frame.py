@@ -230,8 +230,10 @@ def split(frames: RayFrame) -> list[RayFrame]:
 def together(frames: Sequence[Any]) -> Any:
     """Return values of T frames [B, ...] as those of B T frames; of facts what holds for any of them."""
     first = frames[0]
+    if len(frames) == 1:
+        return first
     if isinstance(first, Tensor):
-        return first if len(frames) == 1 else torch.stack([*frames], 1).flatten(0, 1)
+        return torch.stack([*frames], 1).flatten(0, 1)
     if isinstance(first, Facts):
         return first._replace(sided=any(facts.sided for facts in frames))
     if not isinstance(first, tuple):

@@ -4,22 +4,24 @@ Mixtures over windows see the body through a virtual camera that follows it
 (`torchpose.camera._virtual_camera`).
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.module_state import derived
+from torchpose._core.module_state import derived, outside_inference
 from torchpose.camera._virtual_camera import memory_frames, planes_in_view
 from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
-from torchpose.filters._memoryless import frame_evidence
+from torchpose.filters._measurements import Measurements
+from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._window import WindowLayout, WindowPrior
+from torchpose.priors._window import WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._estimator import (
@@ -44,6 +46,7 @@ from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_
 __all__ = ["WindowMixture", "WindowState"]
 
 _N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
+_LIMBS = ARM_JOINTS[:_N_LIMB]
 
 
 class WindowState(NamedTuple):
@@ -103,8 +106,7 @@ class WindowMixture(Estimator):
     def check(self) -> None:
         """Make the filters of hand, head and neck, whose options are checked."""
         for side in ARMS:
-            for joints in (("hand", "head", "neck"), ()):
-                self._filter(side, joints)
+            self._filter(side, ("head", "neck", "hand"))
 
     def init(
         self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
@@ -164,20 +166,50 @@ class WindowMixture(Estimator):
         """Return the estimates of frames; their evidence is that of each frame given its window."""
         arms = {}
         for side, arm in ARMS.items():
-            given = self._given(seen, side, joints[side])
-            model = self._filter(side, joints[side])
-            out = model(*given, lengths=lengths, return_cov=True, progress=progress)
+            measured = _limbs_last(joints[side])
+            model = self._filter(side, measured)
+            frames = model.check(*self._given(seen, side, measured), lengths, None)
             point = None if absence is None else self._outside(seen, absence, side)
-            if point is not None:
-                frames = model.check(*given, lengths, None)
-                out = with_outside_point(model, out, frames, point)
-            if self.of_limbs:
-                torso = tuple(x for x in joints[side] if x not in ARM_JOINTS[:_N_LIMB])
-                context, told = self._evidence(seen, side, torso, lengths), arm[:_N_LIMB]
-            else:
-                context, told = self._evidence(seen, side, (), lengths), arm
-            arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
+            out, context = self._filtered(model, frames, measured, point, progress)
+            told = arm[:_N_LIMB] if self.of_limbs else arm
+            arms[side] = _pose_of_window(in_double(out), context, seen, told)
         return Estimates(arms["left"], arms["right"], seen.view)
+
+    def _filtered(
+        self,
+        model: FixedTrackFilter,
+        frames: Measurements,
+        joints: tuple[str, ...],
+        point: OutsidePoint | None,
+        progress: bool,
+    ) -> tuple[FilterOutput, Tensor]:
+        """Return the estimates of an arm, and the evidence of what it is told beside (`_context`).
+
+        They are of the arm of this frame, followed by its joints in the axes of the torso.
+
+        Args:
+            model, frames: the filter and what it measures. joints: of this frame.
+            point: the evidence that the hand is outside of the image.
+        """
+        wanted = Wanted((*range(STATE_DIM), *self.layout.in_torso), self._context(joints))
+        rule, given, medians = model.weight_rule, (frames, True), model.medians
+        if point is None:
+            if len(medians):
+                medians = _limbs_in_torso(medians.device)
+            out, context = run_with_context(model, rule, medians, *given, wanted, progress)
+        else:
+            whole = wanted._replace(columns=None)
+            out, context = run_with_context(model, rule, medians, *given, whole, progress)
+            out = with_outside_point(model, out, frames, point)
+            kept = torch.tensor(wanted.columns, device=medians.device)
+            cov = require_cov(out)[..., kept[:, None], kept]
+            out = out._replace(mean=out.mean[..., kept], cov=cov)
+        return out, torch.zeros_like(out.log_evidence) if context is None else context
+
+    def _context(self, joints: tuple[str, ...]) -> int:
+        """Return how many of the first measurements are the window's hands, and the torso if it is given."""
+        torso = [joint for joint in joints if joint not in _LIMBS] if self.of_limbs else []
+        return 2 * (self.window.layout.n_hands + len(torso))
 
     def _outside(self, seen: SeenInView, absence: Absence, side: str) -> OutsidePoint | None:
         """Return the evidence that an arm's hand is outside of the image, if there is any in these frames."""
@@ -189,18 +221,10 @@ class WindowMixture(Estimator):
         planes = planes_in_view(absence.planes, seen.view, matrix)
         return OutsidePoint(torch.arange(2, device=planes.device), planes, log_inside)
 
-    def _evidence(
-        self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
-    ) -> Float[Tensor, "B T"]:
-        """Return the log-evidence of some joints of an arm and the hands of the window."""
-        model = self._filter(side, joints)
-        frames = model.check(*self._given(seen, side, joints), lengths, None)
-        return frame_evidence(model, model.weight_rule, frames)
-
     def _given(
         self, seen: SeenInView, side: str, joints: tuple[str, ...]
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return values, mask and R of some joints of an arm and of the hands of the window."""
+        """Return values, mask and R of the hands of the window and of some joints of an arm."""
         cov = self.model.measurement_cov
         noise = _window_noise(seen, self.window, side, joints, cov) if joints else None
         return *_window_inputs(seen, side, joints), noise
@@ -247,16 +271,16 @@ def _window_filter(
     likelihood_power: float,
     dtype: torch.dtype,
 ) -> FixedTrackFilter:
-    """Return the filter of fixed tracks over windows that measures these joints and a window's hands."""
+    """Return the filter of fixed tracks over windows that measures a window's hands and these joints."""
     layout = window.layout
-    blocks = [*measurement_cov[_rows(side, joints)]]
-    blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
+    blocks = [_hand_cov(window, side, measurement_cov)] * layout.n_hands
+    blocks += [*measurement_cov[_rows(side, joints)]]
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
     return FixedTrackFilter(
         getattr(window, side),
         torch.ones(layout.dim, dtype=torch.float64),
         torch.block_diag(*blocks),
-        pixel_indices(joints) + list(layout.hands),
+        list(layout.hands) + pixel_indices(joints),
         transition="ou",
         gamma=0.0,
         weighting="frame",
@@ -275,12 +299,12 @@ def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor
 def _window_inputs(
     seen: SeenInView, side: str, joints: tuple[str, ...]
 ) -> tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]]:
-    """Return values and mask of some joints of an arm, and of the hands of the window."""
+    """Return values and mask of the hands of the window, and of some joints of an arm."""
     rows = _rows(side, joints)
     hands, known = seen.hands[side]
     z, mask = seen.measured.uv[:, :, rows], seen.measured.mask[:, :, rows]
     mask = mask[..., None].expand(z.shape).flatten(-2)
-    return torch.cat([z.flatten(-2), hands], -1), torch.cat([mask, known], -1)
+    return torch.cat([hands, z.flatten(-2)], -1), torch.cat([known, mask], -1)
 
 
 def _window_noise(
@@ -296,7 +320,19 @@ def _window_noise(
     own = seen.measured.cov[..., _rows(side, joints), :, :]
     hand = _hand_cov(window, side, measurement_cov)
     hands = hand.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
-    return block_diagonal(torch.cat([own, hands], -3))
+    return block_diagonal(torch.cat([hands, own], -3))
+
+
+def _limbs_last(joints: tuple[str, ...]) -> tuple[str, ...]:
+    """Return joints in an order in which the torso comes before hand and elbow."""
+    return tuple(sorted(joints, key=lambda joint: joint in _LIMBS))
+
+
+@cache
+def _limbs_in_torso(device: torch.device) -> Int[Tensor, " P"]:
+    """Return the first dimensions of hand and elbow in the axes of the torso, after the arm itself."""
+    with outside_inference():
+        return STATE_DIM + 3 * torch.arange(_N_LIMB, device=device)
 
 
 def _rows(side: str, joints: tuple[str, ...]) -> list[int]:
@@ -305,21 +341,13 @@ def _rows(side: str, joints: tuple[str, ...]) -> list[int]:
 
 
 def _pose_of_window(
-    out: FilterOutput,
-    context: Float[Tensor, "B T"],
-    seen: SeenInView,
-    arm: tuple[int, ...],
-    layout: WindowLayout,
+    out: FilterOutput, context: Float[Tensor, "B T"], seen: SeenInView, arm: tuple[int, ...]
 ) -> FilterOutput:
-    """Return the arm's part of a window's estimate, with its evidence beyond that of the hands.
+    """Return an arm's estimate, with its evidence beyond that of the context.
 
-    The arm's joints in the axes of the torso follow, where the window has them. The evidence is a
-    density over pixels of the prior's camera, not of the virtual one.
+    The evidence is a density over pixels of the prior's camera, not of the virtual one.
     """
     measured = seen.measured.mask[:, :, list(arm)]
     evidence = out.log_evidence - context
     evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
-    evidence = torch.where(measured.any(-1), evidence, torch.zeros_like(evidence))
-    kept = torch.tensor([*range(STATE_DIM), *layout.in_torso], device=out.mean.device)
-    cov = require_cov(out)[..., kept[:, None], kept]
-    return out._replace(mean=out.mean[..., kept], cov=cov, log_evidence=evidence)
+    return out._replace(log_evidence=torch.where(measured.any(-1), evidence, 0.0))
