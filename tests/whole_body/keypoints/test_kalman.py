@@ -186,6 +186,18 @@ def test_who_comes_late_has_no_earlier_pose(four):
     assert float(errors(found, four.joints)[15:].mean()) < 0.012
 
 
+def test_a_start_waits_for_a_second_camera_and_not_for_ever(four):
+    """One camera has no distance: a body that it alone begins would stay at a wrong one."""
+    late, never = four.keypoints[:, :2].clone(), four.keypoints[:, :2].clone()
+    late[:5, 1], never[:, 1] = torch.nan, torch.nan
+    two = tracker(four.rig.select([0, 1]))
+    found = two(keypoints=late)
+    assert found.coasting.tolist() == [True] * 5 + [False] * (len(late) - 5)
+    assert float(errors(found, four.joints)[10:].mean()) < 0.025
+    alone = two(keypoints=never).coasting
+    assert bool(alone[:15].all()) and not bool(alone[17:].any())
+
+
 def test_a_camera_that_sees_something_else_is_named(four):
     keypoints = four.keypoints.clone()
     keypoints[:, 3, :, 0] += 400.0

@@ -32,6 +32,7 @@ _SHARE = (
 )
 _KEPT = 0.3  # seconds over which evidence about hypotheses is summed up
 _FLIP_TIME = 0.1  # seconds after which a limb is mirrored in depth
+_PATIENCE = 0.5  # seconds that a start waits for a second camera, without which it has no distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 
@@ -42,7 +43,7 @@ class KeypointStream(NamedTuple):
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
         begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
-            been of something else. age: [B], frames since tracking began.
+            been of something else, or has waited for a start. age: [B], frames since tracking began.
     """
 
     state: BodyGaussian
@@ -135,8 +136,8 @@ class KeypointTracker(nn.Module):
         Returns:
             The next stream, the poses of the frame [B, ...], and the corrected hypotheses as one Gaussian.
         """
-        n_joints = (frame.inlier > 0).any(-2).sum(-1)
-        enough = n_joints >= LEAST_JOINTS
+        waited = frame.inlier.new_zeros(len(frame.inlier)) if stream is None else stream.lost
+        enough = self._enough(frame, waited)
         if stream is None:
             due = torch.ones_like(enough)
             stream, found = self._started(frame)
@@ -155,6 +156,14 @@ class KeypointTracker(nn.Module):
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough,
         )  # fmt: skip
         return stream, pose, chosen
+
+    def _enough(self, frame: KeypointFrame, waited: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
+        """Return whether tracking may begin: two cameras see the same joints, or have not for long."""
+        n_seeing = (frame.inlier > 0).sum(-2)
+        n_needed = min(2, frame.inlier.shape[-2])
+        patient = waited <= _PATIENCE * self.filter.fps
+        needed = torch.where(patient, n_needed, 1)
+        return (n_seeing >= needed[:, None]).sum(-1) >= LEAST_JOINTS
 
     # --- one frame --------------------------------------------------------------------------------
 
@@ -264,7 +273,9 @@ class KeypointTracker(nn.Module):
         turned = (weighed.exchanged > 0.5).any(-1).any(-1)
         grown = stream.lost + torch.where(found < _LOST * expected, 1.0, 0.5)
         astray = (found < _LOST * expected) | turned
-        return torch.where(expected > 0, torch.where(astray, grown, 0.0), stream.lost)
+        lost = torch.where(astray, grown, 0.0)
+        lost = torch.where(stream.begun, lost, stream.lost + 1)
+        return torch.where(expected > 0, lost, stream.lost)
 
     # --- whole sequences --------------------------------------------------------------------------
 
