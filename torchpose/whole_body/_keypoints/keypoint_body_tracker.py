@@ -299,11 +299,12 @@ class KeypointBodyTracker(nn.Module):
     def _notes(
         self, poses: KeypointPoses, frame: KeypointFrame, b: int, refined: RefinedCameras | None
     ) -> tuple[str, ...]:
+        """Return notes; whether cameras are right is looked at in the first recording of a batch alone."""
         notes = notes_of(
             self.rig.names, frame.inlier > 0, poses.inlier[b], poses.exchanged[b],
             poses.coasting[b], self.sized,
         )  # fmt: skip
-        if len(self.rig) == 1:
+        if len(self.rig) == 1 or b > 0:
             return notes
         rig = self.rig if refined is None else refined.rig
         exchange = self.tracker.filter.exchange
