@@ -19,13 +19,12 @@ from torchpose.cli._track_body_output import (
     BodyJob,
     body_results,
     draw,
-    person_suffix,
     project_joints,
     summary,
     write_page,
     write_people,
 )
-from torchpose.cli._track_output import percent, smoothing_text
+from torchpose.cli._track_output import percent, person_suffix, smoothing_text
 from torchpose.errors import NobodySeenError
 
 if TYPE_CHECKING:
@@ -230,7 +229,7 @@ def _write_skeletons(
     """Draw everybody's skeleton: skeleton.png, skeleton_p02.png and so on."""
     return [
         _write_skeleton(out / f"skeleton{person_suffix(place)}.png", poses, camera)
-        for place, poses in enumerate(people)
+        for place, poses in enumerate(people, 1)
     ]
 
 

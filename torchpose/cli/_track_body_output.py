@@ -6,6 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
+from torchpose.cli._track_output import person_suffix
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -25,7 +27,6 @@ __all__ = [
     "body_results",
     "draw",
     "facts_of",
-    "person_suffix",
     "project_joints",
     "summary",
     "write_page",
@@ -271,15 +272,10 @@ def _overlay_name(camera: str) -> str:
     return f"overlay_{camera}.mp4"
 
 
-def person_suffix(place: int) -> str:
-    """Return what follows the names of the files of a person, counted from 0; nothing for the first."""
-    return "" if place == 0 else f"_p{place + 1:02d}"
-
-
 def write_people(job: BodyJob, out: Path, people: "Sequence[BodyTrack]") -> list[Path]:
     """Write the poses of everybody: body.npz and so on of the first, body_p02.npz of the second."""
     written = []
-    for place, poses in enumerate(people):
+    for place, poses in enumerate(people, 1):
         written += _write_poses(job, out, poses, person_suffix(place))
     return written
 

@@ -21,6 +21,7 @@ __all__ = [
     "TrackingJob",
     "camera_text",
     "percent",
+    "person_suffix",
     "report_failure",
     "smoothing_text",
     "summary",
@@ -177,6 +178,11 @@ def smoothing_text(smoothing: int | str | None) -> str:
     if smoothing is None:
         return ", filtered"
     return ", smoothed" if smoothing == "full" else f", smoothed with {smoothing} later frames"
+
+
+def person_suffix(place: int) -> str:
+    """Return what follows the names of the files of a person, counted from 1; nothing for the first."""
+    return "" if place == 1 else f"_p{place:02d}"
 
 
 def percent(share: float) -> str:

@@ -13,6 +13,7 @@ from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cor
 from torchpose.cli._track_output import (
     TrackingJob,
     camera_text,
+    person_suffix,
     report_failure,
     smoothing_text,
     summary,
@@ -239,7 +240,7 @@ def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
     """Write the poses of everybody and return the paths: poses, and poses_p02 and so on of the others."""
     written = []
     for place, person in enumerate(people, 1):
-        written += write_track(person.track, out, "" if place == 1 else f"_p{place:02d}")
+        written += write_track(person.track, out, person_suffix(place))
     return written
 
 

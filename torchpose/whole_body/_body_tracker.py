@@ -57,7 +57,6 @@ __all__ = ["BodyStream", "BodyTracker"]
 
 _HEIGHT = 1.75  # metres, of a person of unknown height
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
-_UNSEEN = "too few keypoints were given", "not all cameras saw somebody"
 
 
 class BodyStream(NamedTuple):
@@ -316,13 +315,14 @@ class BodyTracker(nn.Module):
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
-            if silhouettes is not None or keypoints is None:
+            if silhouettes is not None:
+                given = "silhouettes" if keypoints is None else "both"
                 raise InputError(
-                    f"method {self.method} takes keypoints and no silhouettes, got "
-                    f"{'silhouettes' if keypoints is None else 'both'}; other methods take either or both"
-                    if silhouettes is not None
-                    else f"method {self.method} takes keypoints, got none"
+                    f"method {self.method} takes keypoints and no silhouettes, got {given}; other methods "
+                    "take either or both"
                 )
+            if keypoints is None:
+                raise InputError(f"method {self.method} takes keypoints, got none")
             if persons is not None and refine != "none":
                 raise InputError(
                     f"refine={refine!r} is for recordings of one person, and persons is given; refine "
@@ -356,9 +356,12 @@ class BodyTracker(nn.Module):
             check_lengths(lengths, 1, there + later, lengths.device)
             poses = repeat_last(poses, later)
         if begun:
-            poses.notes += (
-                f"the first {begun} frames, in which {_UNSEEN[measured is None]}, have no pose",
+            unseen = (
+                "not all cameras saw somebody"
+                if measured is None
+                else "too few keypoints were given"
             )
+            poses.notes += (f"the first {begun} frames, in which {unseen}, have no pose",)
         return poses
 
     @takes_former_arguments

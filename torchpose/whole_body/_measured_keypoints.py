@@ -83,7 +83,7 @@ class BodyKeypointMeasurer:
 
     def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
         """Return the measurement of one frame, of one element."""
-        return KeypointMeasurement(KeypointFrame(*(v[t : t + 1] for v in frames)), self.maps)
+        return KeypointMeasurement(frames.map(lambda v: v[t : t + 1]), self.maps)
 
     def first_frame(self, frames: KeypointFrame) -> int:
         """Return the first frame with enough joints for a first pose.
@@ -101,7 +101,7 @@ class BodyKeypointMeasurer:
 
     def first_pose(self, frames: KeypointFrame) -> Float[Tensor, " D"]:
         """Return the pose of the first of some frames, as the Kalman smoother finds it in all of them."""
-        batch = KeypointFrame(*(value[None] for value in frames))
+        batch = frames.map(lambda value: value[None])
         joints = self.tracker.tracker(batch, smoothing=True).joints[0, :1]
         return fit_state(self.body, joints)[0]
 

@@ -26,6 +26,7 @@ from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_transition import jump_variance, transition
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    NOISE_SCALES,
     Beliefs,
     KeypointFrame,
     RigMaps,
@@ -37,6 +38,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     squared_errors,
     weigh,
 )
+from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.upright import Upright
 
 __all__ = ["BodyGaussian", "BodyKalmanFilter", "CorrectedBody"]
@@ -51,7 +53,6 @@ _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
-_SCALES = (0.3, 20.0)  # factors of a camera's noise
 _SCALE_TIME = 2.0  # seconds over which they are estimated
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
 
@@ -78,11 +79,11 @@ class BodyGaussian(NamedTuple):
 
     def take(self, index: Int[Tensor, " N"]) -> Self:
         """Return some elements of the batch."""
-        return _taken(self, index)
+        return taken(self, index)
 
     def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
         """Return the batch with some elements replaced."""
-        return _put(self, index, other)
+        return mapped(lambda own, new: own.index_copy(0, index, new), self, other)
 
 
 class CorrectedBody(NamedTuple):
@@ -103,11 +104,11 @@ class CorrectedBody(NamedTuple):
 
     def take(self, index: Int[Tensor, " N"]) -> Self:
         """Return some elements of the batch."""
-        return _taken(self, index)
+        return taken(self, index)
 
     def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
         """Return the batch with some elements replaced."""
-        return _put(self, index, other)
+        return mapped(lambda own, new: own.index_copy(0, index, new), self, other)
 
 
 class _Linearised(NamedTuple):
@@ -156,7 +157,7 @@ class BodyKalmanFilter(nn.Module):
         """Move constants with the buffers, as `to` asks for."""
         super()._apply(fn, recurse)
         for name in ("maps", "upright", "exchange", "transition", "_jump_variance"):
-            setattr(self, name, _mapped(getattr(self, name), fn))
+            setattr(self, name, mapped(_of_tensors(fn), getattr(self, name)))
         return self
 
     def predict(self, state: BodyGaussian) -> BodyGaussian:
@@ -327,7 +328,7 @@ class BodyKalmanFilter(nn.Module):
         sums, count = squared_errors(frame, seen, weighed, joint_cov)
         share = (count / _SCALE_COUNT).clamp_max(1) / (_SCALE_TIME * self.fps)
         ratio = sums / count.clamp_min(1e-6)
-        return (scale * (1 + share * (ratio - 1))).clamp(*_SCALES)
+        return (scale * (1 + share * (ratio - 1))).clamp(*NOISE_SCALES)
 
     # --- joints elsewhere than predicted ------------------------------------------------------------
 
@@ -344,27 +345,9 @@ class BodyKalmanFilter(nn.Module):
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
 
 
-def _mapped(value: Any, fn: Callable[[Tensor], Tensor]) -> Any:
-    """Return a tensor, or a named tuple with tensors, with a function applied to every tensor."""
-    if isinstance(value, Tensor):
-        return fn(value)
-    if not isinstance(value, tuple):
-        return value
-    return type(value)(*(_mapped(part, fn) for part in value))  # type: ignore[arg-type]
-
-
-def _taken(value: Any, index: Tensor) -> Any:
-    """Return some elements of a tensor, or of named tuples of tensors."""
-    if isinstance(value, Tensor):
-        return value[index]
-    return type(value)(*(_taken(part, index) for part in value))
-
-
-def _put(value: Any, index: Tensor, other: Any) -> Any:
-    """Return a tensor, or named tuples of tensors, with some elements replaced."""
-    if isinstance(value, Tensor):
-        return value.index_copy(0, index, other)
-    return type(value)(*(_put(a, index, b) for a, b in zip(value, other, strict=True)))
+def _of_tensors(fn: Callable[[Tensor], Tensor]) -> Callable[[Any], Any]:
+    """Return a function that leaves what is no tensor as it is."""
+    return lambda value: fn(value) if isinstance(value, Tensor) else value
 
 
 def _plus_one(matrix: Tensor) -> Tensor:

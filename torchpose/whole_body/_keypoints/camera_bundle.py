@@ -23,6 +23,8 @@ from torchpose.camera._rig import CameraRig
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    LEAST_DEPTH,
+    NOISE_SCALES,
     Beliefs,
     Exchange,
     KeypointFrame,
@@ -46,10 +48,8 @@ __all__ = [
 
 N_ERRORS = 7  # of a camera: rotation, shift, delay
 ROTATION_STD, SHIFT_STD = 0.0175, 0.03  # radians, metres
-_LEAST_DEPTH = 0.05  # metres
 _EXCHANGED = -3.5  # prior log-odds of exchanged sides
 _JOINT_STD = 5.0  # metres, of joints about where tracking has them; tells where no two cameras do
-_SCALES = (0.3, 20.0)  # factors of a camera's noise
 
 
 class CameraErrors(NamedTuple):
@@ -182,7 +182,7 @@ def _equations(
     weighed = weigh(frames, seen, maps, beliefs, given.exchange, cov, decide=width < 2, width=width)
     sums, number = squared_errors(frames, seen, weighed, cov)
     ratio = sums.sum(0) / number.sum(0).clamp_min(1e-6) * width
-    scale = (scale * ratio).clamp(*_SCALES) if joint_cov is not None else scale
+    scale = (scale * ratio).clamp(*NOISE_SCALES) if joint_cov is not None else scale
     w = (weighed.own / weighed.variance)[..., None, None]
     A, r = seen.by_joint, (frames.pixels - seen.pixels)[..., None]
     Aw, Bw = (w * A).mT, (w * by_errors).mT
@@ -214,7 +214,7 @@ def _seen(
     moved = joints[:, None] - late * velocity[:, None]
     X = moved @ R.mT + t[:, None]
     depth = X[..., 2]
-    in_front = depth > _LEAST_DEPTH
+    in_front = depth > LEAST_DEPTH
     depth = torch.where(in_front, depth, 1.0)[..., None]
     homogeneous = X @ rig.matrix.mT
     pixels = homogeneous[..., :2] / depth

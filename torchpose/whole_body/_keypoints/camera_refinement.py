@@ -117,10 +117,10 @@ def refine_cameras(
             break
     assert adjusted is not None
     better = _corrected(rig, errors.values)
-    after = track(better, _in_time(rig, frames, errors.values, poses), smoothing)
+    moved = _in_time(rig, frames, errors.values, poses)
+    after = track(better, moved, smoothing)
     gain = _gain(frames, before, after, errors.values[:, DELAY].round()) - adjusted.price
     if gain > _LEAST_GAIN:
-        moved = _in_time(rig, frames, errors.values, poses)
         return RefinedCameras(errors, better, moved, after, gain, kept=False)
     before = before if smoothing else track(rig, frames, False)
     same = CameraErrors(torch.zeros_like(errors.values), errors.cov)
@@ -165,7 +165,7 @@ def given_for(
     shifts = delays.round()
     moved, _ = shifted(frames, shifts.long())
     if stride > 1:
-        moved = KeypointFrame(*(value[::stride] for value in moved))
+        moved = moved.map(lambda value: value[::stride])
     block = max(1, round(_BLOCK * fps / stride))
     return BundleInputs(
         moved, joints[::stride], _velocities(joints)[::stride], shifts, free, _DELAY_STD * fps,

@@ -112,6 +112,6 @@ def shifted(
     count = len(frames.pixels)
     rows = torch.arange(count)[:, None]
     places = (rows + delays).clamp(0, count - 1)
-    moved = KeypointFrame(*(value[places, torch.arange(len(delays))] for value in frames))
+    moved = frames.map(lambda value: value[places, torch.arange(len(delays))])
     trust = torch.where(places == rows + delays, 1.0, beyond).to(moved.inlier)
     return moved._replace(inlier=moved.inlier * trust[..., None]), places - rows

@@ -124,12 +124,12 @@ class KeypointBodyTracker(nn.Module):
         frames = self.frames(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
         if single:
-            frames = KeypointFrame(*(value[None] for value in frames))
+            frames = frames.map(lambda value: value[None])
         self._check_seen(frames)
         if refine != "none":
             return self._refined_track(frames, refine, smoothing == "full", progress)
         poses = self.tracker(frames, smoothing == "full", progress)
-        tracks = [self.track(poses, frames, b) for b in range(len(frames.pixels))]
+        tracks = [self.track(poses, frames, b, cameras=b == 0) for b in range(len(frames.pixels))]
         return tracks[0] if single else tracks
 
     @torch.no_grad()
@@ -145,10 +145,10 @@ class KeypointBodyTracker(nn.Module):
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
         frame = self.frames(keypoints, confidence, names, covariance)
-        frame = KeypointFrame(*(value[None] for value in frame))
+        frame = frame.map(lambda value: value[None])
         stream, pose, _ = self.tracker.advance(stream, frame)
         poses = _with_time(pose)
-        frames = KeypointFrame(*(value[:, None] for value in frame))
+        frames = frame.map(lambda value: value[:, None])
         return stream, self.track(poses, frames, 0, summed_up=False)
 
     # --- cameras ----------------------------------------------------------------------------------
@@ -176,13 +176,13 @@ class KeypointBodyTracker(nn.Module):
 
         def track(rig: CameraRig, moved: KeypointFrame, smooth: bool) -> KeypointPoses:
             tracker = KeypointTracker(rig, self.fps, former.motion, upright=former.upright)
-            return tracker(KeypointFrame(*(value[None] for value in moved)), smooth, progress)
+            return tracker(moved.map(lambda value: value[None]), smooth, progress)
 
-        single = KeypointFrame(*(value[0] for value in frames))
+        single = frames.map(lambda value: value[0])
         found = refine_cameras(
             self.rig, single, track, self.fps, refine, former.exchange, smoothing
         )
-        moved = KeypointFrame(*(value[None] for value in found.frames))
+        moved = found.frames.map(lambda value: value[None])
         result = self.track(found.poses, moved, 0, refined=found)
         notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes)
         details = details_of_cameras(found, len(result))
@@ -258,6 +258,7 @@ class KeypointBodyTracker(nn.Module):
         frames: KeypointFrame,
         b: int,
         summed_up: bool = True,
+        cameras: bool = True,
         refined: RefinedCameras | None = None,
     ) -> BodyTrack:
         """Return the track of one element of the batch."""
@@ -267,7 +268,7 @@ class KeypointBodyTracker(nn.Module):
         lengths = bones.norm(dim=-1)
         rigid = _rigid_body(bones)
         state = rigid.state_of(point.position, body.world_rotations(point))
-        frame = KeypointFrame(*(value[b] for value in frames))
+        frame = frames.map(lambda value: value[b])
         return BodyTrack(
             rigid,
             state,
@@ -279,7 +280,7 @@ class KeypointBodyTracker(nn.Module):
             poses.coasting[b],
             poses.started[b] & (poses.started[b].cumsum(0) > 1),
             self.fps,
-            notes=self._notes(poses, frame, b, refined) if summed_up else (),
+            notes=self._notes(poses, frame, b, cameras, refined) if summed_up else (),
             details={
                 "inlier": poses.inlier[b],
                 "exchanged": poses.exchanged[b],
@@ -297,14 +298,18 @@ class KeypointBodyTracker(nn.Module):
         return torch.cat([std[:, body.columns["position"]], turns.flatten(1)], -1)
 
     def _notes(
-        self, poses: KeypointPoses, frame: KeypointFrame, b: int, refined: RefinedCameras | None
+        self,
+        poses: KeypointPoses,
+        frame: KeypointFrame,
+        b: int,
+        cameras: bool,
+        refined: RefinedCameras | None,
     ) -> tuple[str, ...]:
-        """Return notes; whether cameras are right is looked at in the first recording of a batch alone."""
         notes = notes_of(
             self.rig.names, frame.inlier > 0, poses.inlier[b], poses.exchanged[b],
             poses.coasting[b], self.sized,
         )  # fmt: skip
-        if len(self.rig) == 1 or b > 0:
+        if len(self.rig) == 1 or not cameras:
             return notes
         rig = self.rig if refined is None else refined.rig
         exchange = self.tracker.filter.exchange

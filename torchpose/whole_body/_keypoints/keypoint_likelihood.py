@@ -12,6 +12,7 @@ over time. All of it is marginalised: the filter gets expected information about
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import torch
@@ -22,6 +23,8 @@ from torchpose.body._skeleton import BodySkeleton, other_side
 from torchpose.camera._rig import CameraRig
 
 __all__ = [
+    "LEAST_DEPTH",
+    "NOISE_SCALES",
     "Beliefs",
     "Exchange",
     "KeypointFrame",
@@ -35,7 +38,8 @@ __all__ = [
     "weigh",
 ]
 
-_LEAST_DEPTH = 0.05  # metres in front of a camera; nearer points are not seen by it
+NOISE_SCALES = (0.3, 20.0)  # least and largest factor of a camera's noise
+LEAST_DEPTH = 0.05  # metres in front of a camera; nearer points are not seen by it
 _LEAST = 1e-30  # probability
 _LEGS = ("hip", "knee", "ankle")
 
@@ -78,9 +82,13 @@ class KeypointFrame(NamedTuple):
     relative: Tensor
     inlier: Tensor
 
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """Return the keypoints with a function applied to every tensor."""
+        return type(self)(*(change(value) for value in self))
+
     def take(self, index: Int[Tensor, " N"]) -> Self:
         """Return the keypoints of some elements of the batch."""
-        return type(self)(*(value[index] for value in self))
+        return self.map(lambda value: value[index])
 
 
 class Seen(NamedTuple):
@@ -147,7 +155,7 @@ def see(maps: RigMaps, joints: Float[Tensor, "B J 3"]) -> Seen:
     """
     homogeneous = joints.unsqueeze(-3) @ maps.matrix.mT + maps.shift[:, None]
     depth = homogeneous[..., 2]
-    in_front = depth > _LEAST_DEPTH
+    in_front = depth > LEAST_DEPTH
     depth = torch.where(in_front, depth, 1.0)[..., None]
     pixels = homogeneous[..., :2] / depth
     rows = maps.matrix[:, None, :2] - pixels[..., None] * maps.matrix[:, None, 2:]

@@ -21,6 +21,7 @@ from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.depth_flips import flip
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
 __all__ = ["LEAST_JOINTS", "KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
@@ -113,7 +114,7 @@ class KeypointTracker(nn.Module):
         stream: KeypointStream | None = None
         poses, corrected = [], []
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
-            frame = KeypointFrame(*(value[:, t] for value in frames))
+            frame = frames.map(lambda value: value[:, t])  # noqa: B023
             stream, pose, found = self.advance(stream, frame)
             poses.append(pose)
             if smoothing:
@@ -303,7 +304,4 @@ class KeypointTracker(nn.Module):
 
 def stacked(poses: Sequence[Any]) -> Any:
     """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
-    first = poses[0]
-    if isinstance(first, Tensor):
-        return torch.stack(list(poses), 1)
-    return type(first)(*(stacked(values) for values in zip(*poses, strict=True)))
+    return mapped(lambda *values: torch.stack(values, 1), *poses)

@@ -129,7 +129,7 @@ def _hungarian(values: np.ndarray) -> np.ndarray:
 def taken_detections(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> KeypointFrame:
     """Return the keypoints [P, C, J] of the detections of persons, none where it is -1."""
     cameras = torch.arange(chosen.shape[1], device=chosen.device)
-    values = KeypointFrame(*(value[chosen.clamp_min(0), cameras] for value in frame))
+    values = frame.map(lambda value: value[chosen.clamp_min(0), cameras])
     return values._replace(inlier=torch.where((chosen >= 0)[..., None], values.inlier, 0.0))
 
 

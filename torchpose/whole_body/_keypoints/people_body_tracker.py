@@ -18,11 +18,11 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointPoses,
     stacked,
 )
+from torchpose.whole_body._keypoints.nested import taken
 from torchpose.whole_body._keypoints.people_tracker import (
     PeopleFrame,
     PeopleStream,
     PeopleTracker,
-    taken,
 )
 
 __all__ = ["ALL_PERSONS", "PeopleBodyTracker"]
@@ -77,7 +77,7 @@ class PeopleBodyTracker:
             raise NobodySeenError("the detections have no keypoint in any camera and frame")
         stream, rows = None, defaultdict[int, list[_Row]](list)
         for t in tqdm(range(len(keypoints)), disable=not progress, unit="frame"):
-            frame = KeypointFrame(*(value[t] for value in frames))
+            frame = frames.map(lambda value: value[t])  # noqa: B023
             stream, found = self.people.advance(stream, frame)
             numbers = [] if found is None else found.number.tolist()
             for row, number in enumerate(numbers):

@@ -14,6 +14,7 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointStream,
     KeypointTracker,
 )
+from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.people_association import (
     assign,
     detection_gains,
@@ -21,7 +22,7 @@ from torchpose.whole_body._keypoints.people_association import (
     taken_detections,
 )
 
-__all__ = ["PeopleFrame", "PeopleStream", "PeopleTracker", "taken"]
+__all__ = ["PeopleFrame", "PeopleStream", "PeopleTracker"]
 
 _CONFIRM_TIME, _CONFIRM_FRAMES = 0.1, 3  # seconds, and frames at least, that confirm a person
 _TENTATIVE_TIME = 0.1  # seconds without agreeing cameras after which somebody unconfirmed is nobody
@@ -240,17 +241,6 @@ def _doubled(joints: Float[Tensor, "P J 3"]) -> Bool[Tensor, " P"]:
     return (torch.where(earlier, apart, math.inf) < _SAME).any(-1)
 
 
-def taken(value: Any, rows: Tensor) -> Any:
-    """Return some persons of a tensor, or of named tuples of tensors."""
-    if isinstance(value, Tensor):
-        return value[rows]
-    return type(value)(*(taken(part, rows) for part in value))
-
-
 def _joined(first: Any, second: Any) -> Any:
-    """Return the persons of two tensors, or of named tuples of tensors, in one; numbers are the second's."""
-    if isinstance(first, Tensor):
-        return torch.cat([first, second])
-    if isinstance(first, int):
-        return second
-    return type(first)(*(_joined(a, b) for a, b in zip(first, second, strict=True)))
+    """Return the persons of two named tuples of tensors in one; numbers are the second's."""
+    return mapped(lambda a, b: torch.cat([a, b]) if isinstance(a, Tensor) else b, first, second)
