@@ -1,10 +1,12 @@
-"""`train fit` in processes that are forked from one that has loaded Lightning, which takes seconds."""
+"""Work in processes that are forked from one that has loaded Lightning, which takes seconds."""
 
 import multiprocessing
 import os
 import signal
 import sys
+import traceback
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 _CONTEXT = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
@@ -56,3 +58,27 @@ def _fit(arguments: list[str], errors: Path, ignored: tuple[type[Warning], ...])
     for kind in (DeprecationWarning, *ignored):
         warnings.simplefilter("ignore", kind)
     sys.exit(main(["fit", *arguments]))
+
+
+def run_apart(work: Callable[[], object], timeout: float = 120) -> None:
+    """Do work in a process of its own, which ends without freeing what the work returned.
+
+    A group of gloo that is freed waits for its threads, and now and then they wait for Python's lock,
+    which the one that frees holds: what holds such a group is returned, and never freed.
+    """
+    process = _CONTEXT.Process(target=_work, args=(work,))
+    process.start()
+    process.join(timeout)
+    if process.exitcode is None:
+        process.kill()
+    assert process.exitcode == 0, f"it ended with {process.exitcode}; None: not within {timeout} s"
+
+
+def _work(work: Callable[[], object]) -> None:
+    status = 1
+    try:
+        _kept = work()  # until the process ends
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    os._exit(status)

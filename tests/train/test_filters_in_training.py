@@ -7,6 +7,7 @@ import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from tests.train.forked import run_apart
 from torchpose import GaussianMixture
 from torchpose.filters import MixtureKalmanFilter
 
@@ -61,20 +62,23 @@ def test_lightning_trains_a_filter_and_loads_it_from_its_checkpoint(tmp_path):
     torch.testing.assert_close(found.log_evidence, expected.log_evidence, rtol=0, atol=0)
 
 
-def test_data_parallel_processes_train_a_filter():
+def train_in_parallel():
+    """Train a filter alone and as one of one process; their steps are equal."""
     dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
-    try:
-        alone, wrapped = learnt_filter(0.5, 1.0), learnt_filter(0.5, 1.0)
-        parallel = DistributedDataParallel(wrapped)
-        for _ in range(2):  # the second step builds on a graph of its own
-            for model in (alone, parallel):
-                model.zero_grad()
-                (-model(measurements()).log_evidence.sum()).backward()
-            for own, other in zip(alone.parameters(), wrapped.parameters(), strict=True):
-                torch.testing.assert_close(own.grad, other.grad)
-                with torch.no_grad():
-                    own -= 0.01 * own.grad
-                    other -= 0.01 * other.grad
-        assert bool(wrapped.process_cov.grad.abs().sum() > 0)
-    finally:
-        dist.destroy_process_group()
+    alone, wrapped = learnt_filter(0.5, 1.0), learnt_filter(0.5, 1.0)
+    parallel = DistributedDataParallel(wrapped)
+    for _ in range(2):  # the second step builds on a graph of its own
+        for model in (alone, parallel):
+            model.zero_grad()
+            (-model(measurements()).log_evidence.sum()).backward()
+        for own, other in zip(alone.parameters(), wrapped.parameters(), strict=True):
+            torch.testing.assert_close(own.grad, other.grad)
+            with torch.no_grad():
+                own -= 0.01 * own.grad
+                other -= 0.01 * other.grad
+    assert bool(wrapped.process_cov.grad.abs().sum() > 0)
+    return parallel
+
+
+def test_data_parallel_processes_train_a_filter():
+    run_apart(train_in_parallel)
