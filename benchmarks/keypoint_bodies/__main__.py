@@ -3,8 +3,8 @@
 Recorded bodies (walks and actions of CMU, Berkeley MHAD) are seen by rings of cameras of 1920 x 1080 pixels
 at 3 to 5 m, through a detector with 4 px of noise, 10 % missing in bursts, 5 % outliers, and left and right
 exchanged in 3 % of the frames. Persons who are scored are not among those on whom constants were chosen,
-or methods learned. In the recording of Pose2Sim a person is seen by four real cameras: every one is
-predicted from the others.
+or methods learned. Persons whom a Kinect recorded are seen by one camera in its place. In the recording of
+Pose2Sim a person is seen by four real cameras: every one is predicted from the others.
 
     python -m benchmarks.keypoint_bodies --data DIR [--out FILE] [--methods NAME ...] [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
@@ -23,13 +23,23 @@ import torch
 from benchmarks._command import OneOf, run_command
 from benchmarks._table_file import TableFile
 from benchmarks.keypoint_bodies.choosing import add_choices
-from benchmarks.keypoint_bodies.clips import CHOOSING, RIGS, SCORED, begun, read_clips
+from benchmarks.keypoint_bodies.clips import (
+    CHOOSING,
+    KINECT,
+    KINECT_SCORED,
+    RIGS,
+    SCORED,
+    begun,
+    read_clips,
+    read_kinect,
+)
 from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, methods_of
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.tables import add_table
 from torchpose.evaluation import Report
 
 _ALL = (*METHODS, *LIFTERS)
+_KINECT_TITLE = "One camera, persons of a Kinect (mm)"
 
 
 def main(
@@ -67,6 +77,8 @@ def main(
         chosen = methods_of(methods, data, lifters, quick)
         for cameras in RIGS:
             add_table(report, chosen, clips, cameras)
+        kinect = read_kinect(data, KINECT_SCORED[:1] if quick else KINECT_SCORED)
+        add_table(report, chosen, {KINECT: kinect}, 1, _KINECT_TITLE)
         add_real_table(report, chosen, data, quick)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))

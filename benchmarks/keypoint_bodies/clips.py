@@ -5,6 +5,9 @@ actions of CMU name no person and are all on one skeleton, whose bone lengths ar
 split by action, and the walkers 10, 16 and 35, who probably play soccer and run as well, are on the
 same side of the split. Each of their files begins with a frame in the rest pose, which is left out, and one
 file in which the body falls apart is not used. Berkeley MHAD has no head.
+
+The persons of UTD-MHAD are seen from where their Kinect was, by one camera. Their skeletons are Kinect's,
+with other joints than motion capture has: none of the methods here has learned from such.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip, read_mocap
 
 WALKS, ACTIONS, MHAD = "mocap_cmu_walk", "mocap_cmu_actions", "mocap_berkeley_mhad"
+KINECT = "kinect_utd_mhad"
 
 CHOOSING = {
     WALKS: ("s02_02_01_walk", "s05_05_01_walk", "s06_06_01_walk", "s07_07_01_walk",
@@ -50,6 +54,9 @@ SCORED = {
 }  # fmt: skip
 """Recordings that are scored, by set; of persons, or actions, who are not in `CHOOSING`."""
 
+KINECT_SCORED = tuple(f"s0{5 + action % 4}_a{action:02d}_*_t1" for action in range(1, 28))
+"""Recordings of UTD-MHAD that are scored: every action of one of s5 to s8."""
+
 TRAINING = {
     WALKS: ("s02_*", "s05_*", "s06_*", "s07_*", "s08_*", "s39_*"),
     ACTIONS: ("basketball_*", "directing_traffic_train_4", "washwindow_*"),
@@ -67,6 +74,8 @@ _AZIMUTHS, _JITTER = (35.0, 125.0, 215.0, 305.0), 10.0  # degrees from the front
 _DISTANCE, _CAMERA_HEIGHT, _NEAREST = (3.0, 5.0), (1.0, 2.5), 2.0  # metres
 _LONGEST_FOCAL, _MARGIN = 1500.0, 60.0  # pixels
 _PELVIS = BODY_15.joint("pelvis")
+_HIPS = [BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
+_KINECT_FOCAL = 1575.0  # pixels: three times that of an image of 640
 
 
 class Faults(NamedTuple):
@@ -156,6 +165,31 @@ def read_clips(
         folder: [see(clip, seed, faults) for clip in recorded(data / folder, chosen)]
         for folder, chosen in names.items()
     }
+
+
+def read_kinect(
+    data: Path, names: Sequence[str] = KINECT_SCORED, seed: int = 0, faults: Faults = FAULTS
+) -> list[Clip]:
+    """Return recordings of UTD-MHAD in one camera where the Kinect was, with its axes.
+
+    The pelvis is the middle of the hips, as detectors have it; Kinect's is higher.
+
+    Args:
+        data: folder with the set. names: of files without their suffix, or patterns. seed: of faults.
+        faults: of the detector.
+    """
+    camera = PinholeCamera(
+        _KINECT_FOCAL, _KINECT_FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT, "kinect",
+        rotation=(0.0, 0.0, math.pi), translation=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    rig, found = CameraRig([camera]), []
+    for clip in recorded(data / KINECT, names):
+        generator = torch.Generator().manual_seed(int(settings_hash([clip.trial, seed])[:8], 16))
+        joints = clip.joints.double()
+        joints[:, _PELVIS] = joints[:, _HIPS].mean(1)
+        seen = detect(rig(joints).pixels, generator, faults)
+        found.append(Clip(clip.trial, clip.fps, joints, clip.up.double(), rig, seen))
+    return found
 
 
 def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iterator[MocapClip]:

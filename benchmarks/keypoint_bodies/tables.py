@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import torch
 from tqdm.auto import tqdm
 
-from benchmarks.keypoint_bodies.clips import ACTIONS, MHAD, WALKS, Clip
+from benchmarks.keypoint_bodies.clips import ACTIONS, KINECT, MHAD, WALKS, Clip
 from benchmarks.keypoint_bodies.methods import CAUSAL, Method, takes
 from benchmarks.keypoint_bodies.scoring import Score, score
 from torchpose.evaluation import Report
 
-_SETS = {WALKS: "walks", ACTIONS: "actions", MHAD: "MHAD"}
+_SETS = {WALKS: "walks", ACTIONS: "actions", MHAD: "MHAD", KINECT: "Kinect"}
 _MEASURES = {
     "all": "error", "rigid": "rigid", "with scale": "similar", "seldom seen": "unseen",
     "exchanged": "exchanged", "jitter": "jitter", "50 %": "inside_50", "90 %": "inside_90",
@@ -42,22 +42,26 @@ def score_clips(method: Method, clips: Sequence[Clip], cameras: int) -> list[Sco
 
 
 def add_table(
-    report: Report, methods: Mapping[str, Method], clips: Mapping[str, Sequence[Clip]], cameras: int
+    report: Report,
+    methods: Mapping[str, Method],
+    clips: Mapping[str, Sequence[Clip]],
+    cameras: int,
+    title: str = "",
 ) -> None:
     """Add the table of a number of cameras, if a method takes so many.
 
     Args:
         report: gets the table. methods: by name; those that take another number are left out.
-        clips: by set. cameras: how many.
+        clips: by set. cameras: how many. title: of the table; by default the number of cameras.
     """
     able = {name: method for name, method in methods.items() if takes(name, cameras)}
     if not able:
         return
     several = cameras > 1
-    title = f"{cameras} cameras (mm)" if several else "One camera (mm)"
+    title = title or (f"{cameras} cameras (mm)" if several else "One camera (mm)")
     table = report.table(
         title, title, [*(_SETS[name] for name in clips), *_MEASURES],
-        digits=_DIGITS, note=(_SEVERAL if several else _ONE) + _NOTE,
+        digits=_DIGITS[-len(clips) - len(_MEASURES) :], note=(_SEVERAL if several else _ONE) + _NOTE,
     )  # fmt: skip
     for name, method in tqdm(able.items(), desc=title):
         groups = [torch.tensor(score_clips(method, group, cameras)) for group in clips.values()]

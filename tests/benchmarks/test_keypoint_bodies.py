@@ -10,11 +10,16 @@ from benchmarks.keypoint_bodies.clips import (
     CHOOSING,
     CLEAN,
     FAULTS,
+    HEIGHT,
+    KINECT,
+    KINECT_SCORED,
     MHAD,
     SCORED,
     WALKS,
+    WIDTH,
     bursts,
     draw_ring,
+    read_kinect,
     see,
 )
 from benchmarks.keypoint_bodies.joint_filters import project_one
@@ -29,6 +34,7 @@ from benchmarks.keypoint_bodies.triangulation import (
     without_outliers,
 )
 from tests.data import data_dir_or_skip
+from torchpose.body import BODY_15
 from torchpose.demo._rendering.walk import walk, walk_clip
 
 PEERS = [name for name in METHODS if name not in OURS]
@@ -160,6 +166,18 @@ def test_a_lifted_body_is_put_where_its_keypoints_are(clean):
     assert float((found - alone.joints).abs().max()) < 1e-4
 
 
+def test_persons_of_a_kinect_stand_before_it_with_their_left_at_the_right():
+    data = data_dir_or_skip(KINECT).parent
+    (clip,) = read_kinect(data, KINECT_SCORED[:1], faults=CLEAN)
+    pixels = clip.seen.keypoints[:, 0]
+    left, right, head, hip = (
+        pixels[:, BODY_15.joint(n)] for n in ("left_shoulder", "right_shoulder", "head", "left_hip")
+    )
+    assert bool((left[:, 0] > right[:, 0]).all()) and bool((head[:, 1] < hip[:, 1]).all())
+    assert 2 < float(clip.joints[:, 0, 2].mean()) < 4
+    assert bool(((pixels > 0) & (pixels < torch.tensor([WIDTH, HEIGHT]))).all())
+
+
 def test_a_real_camera_is_predicted_from_the_others():
     filmed = read_filmed(data_dir_or_skip("multicam_pose2sim").parent)
     errors = predicted(METHODS["pose2sim"], filmed, 3)
@@ -168,7 +186,7 @@ def test_a_real_camera_is_predicted_from_the_others():
 
 def test_quick_run_prints_every_peer(run_here, tmp_path):
     data = data_dir_or_skip("mocap_cmu_walk").parent
-    for name in (ACTIONS, MHAD, "multicam_pose2sim"):
+    for name in (ACTIONS, KINECT, MHAD, "multicam_pose2sim"):
         data_dir_or_skip(name)
     weights = tmp_path / "lifters.safetensors"
     names = [*PEERS, "gru", "mlp", "mean-pose"]
@@ -176,5 +194,6 @@ def test_quick_run_prints_every_peer(run_here, tmp_path):
     printed = run_here("keypoint_bodies.__main__", "--quick", *options, "--methods", *names)
     assert weights.is_file()
     assert printed.count("| pose2sim |") == 4
-    assert printed.count("| gru * |") == 2
+    assert printed.count("| gru * |") == 3
+    assert "persons of a Kinect" in printed
     assert (tmp_path / "keypoint_bodies.md").read_text().split() == printed.split()
