@@ -141,14 +141,30 @@ def test_a_height_tells_the_legs(motion):
     assert (torch.linalg.eigvalsh(tall.scale_cov) > 0).all()
 
 
-def test_one_camera_fixes_limbs_and_leaves_the_prior_alone(motion):
+def test_one_camera_fixes_the_legs_and_leaves_the_prior_alone(motion):
     before = motion.scale_cov.clone()
-    one = of_one_camera(motion, lengths_fixed=True)
-    std = one.scale_cov.diagonal().sqrt()
-    assert float(std[motion.articulation.groups.index("knee")]) == pytest.approx(0.01)
-    assert float(std[motion.articulation.groups.index("neck")]) == pytest.approx(0.1)
+    one = of_one_camera(motion)
+    names = motion.articulation.groups
+    legs = torch.tensor([0.5 * (name in ("knee", "ankle")) for name in names]).double()
+    assert float(legs @ one.scale_cov @ legs) <= 0.0101**2
+    std, usual = one.scale_cov.diagonal().sqrt(), motion.scale_cov.diagonal().sqrt()
+    assert (std < usual).all()
+    assert float(std[names.index("hip")]) > 0.1
+    assert (torch.linalg.eigvalsh(one.scale_cov) > 0).all()
     assert float(one.pull_time) < float(motion.pull_time)
     torch.testing.assert_close(motion.scale_cov, before)
+
+
+def test_who_bends_far_is_expected_upright_with_less_force():
+    """The variance of the lean grows with the square of the gap, as that of a t distribution does."""
+    body, upright = Articulation(), camera_up(ring(1))
+    lean = upright.lean(body, random_point(body, 20))
+    far = (lean.gap.square() / upright.variance).sum(-1)
+    order = far.argsort()
+    grown = (lean.variance / upright.variance)[order]
+    assert float(far.max()) > 20 > 1 > float(far.min())
+    assert (grown.diff(dim=0) > 0).all()
+    assert float(grown[0, 0]) < 1 < float(grown[-1, 0])
 
 
 def test_hypotheses_are_output_as_one_gaussian_with_their_mean_and_spread(motion):

@@ -185,9 +185,9 @@ class BodyKalmanFilter(nn.Module):
 
     def _erected(self, state: BodyGaussian, upright: Upright, share: float) -> BodyGaussian:
         """Return the Gaussian after a share of the information about the lean of the pelvis."""
-        gap, H = upright.lean(self.articulation, state.mean)
+        gap, variance, H = upright.lean(self.articulation, state.mean)
         HP = H @ state.cov
-        spread = HP @ H.mT + torch.diag(upright.variance / share)
+        spread = HP @ H.mT + torch.diag_embed(variance / share)
         chol = torch.linalg.cholesky((spread + spread.mT) / 2)
         U = torch.linalg.solve_triangular(chol, HP, upper=False)
         step = (HP.mT @ torch.cholesky_solve(gap[..., None], chol)).squeeze(-1)

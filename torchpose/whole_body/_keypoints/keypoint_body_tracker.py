@@ -95,7 +95,7 @@ class KeypointBodyTracker(nn.Module):
         elif height is not None:
             motion = with_height(motion, check_positive("height", height))
         if alone:
-            motion = of_one_camera(motion, body is None)
+            motion = of_one_camera(motion)
         self.sized = body is not None or height is not None
         lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
         known = None if up is None else known_up(rig, up)

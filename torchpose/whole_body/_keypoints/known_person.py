@@ -14,8 +14,7 @@ from torchpose.priors._body_motion import BodyMotion
 __all__ = ["of_one_camera", "with_body", "with_height"]
 
 _LENGTH_STD = 0.01  # of the log of a given bone length
-_TRUNK = ("neck", "shoulder", "hip")  # where joint sets differ in what they call a joint
-_TRUNK_STD_OF_ONE = 0.1  # of the log of their lengths
+_PROPORTIONS_SHARE = 0.3  # of the variance of proportions over persons
 _SHIFT_STD_OF_ONE, _SHIFT_TIME_OF_ONE = 0.015, 0.5  # metres, seconds
 _PULL_TIME_OF_ONE = 0.05  # seconds
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
@@ -37,8 +36,7 @@ def with_body(motion: BodyMotion, body: Body) -> BodyMotion:
 def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     """Return the prior of a person whose height is known, which tells the scale of the legs."""
     body = motion.articulation
-    told = torch.tensor([name in ("knee", "ankle") for name in body.groups]).to(motion.scale_mean)
-    told = told / told.sum()
+    told = _of_legs(motion)
     wanted = body.scales_of(BODY_15.standard_lengths(height).to(motion.scale_mean)) @ told
     cross = motion.scale_cov @ told
     gain = cross / (told @ cross + _HEIGHT_STD**2)
@@ -47,26 +45,37 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     return _with(motion, {"scale_mean": mean, "scale_cov": (cov + cov.mT) / 2})
 
 
-def of_one_camera(motion: BodyMotion, lengths_fixed: bool) -> BodyMotion:
+def of_one_camera(motion: BodyMotion) -> BodyMotion:
     """Return the prior for one camera, in which neither sizes nor the depths of limbs are seen.
 
-    Limbs keep the lengths that are expected, and the trunk nearly. Corrections that are linear in lengths
-    would shrink the body frame by frame, since a bone that is seen shorter is mostly turned and not short.
-    For the same reason joints of the trunk shift little. Poses are pulled to the mixture more strongly.
-
-    Args:
-        motion: the prior. lengths_fixed: whether lengths are to be fixed; a given body's are already.
+    The legs together keep the length that is expected, since nothing tells a small person from a far one.
+    Proportions may differ from it, but less than over persons: corrections that are linear in lengths take a
+    bone that is turned for one that is short. For the same reason joints of the trunk shift little. Poses are
+    pulled to the mixture more strongly.
     """
-    std = torch.full_like(motion.scale_mean, _LENGTH_STD)
-    std[[motion.articulation.groups.index(name) for name in _TRUNK]] = _TRUNK_STD_OF_ONE
     given = {
         "pull_time": torch.full_like(motion.pull_time, _PULL_TIME_OF_ONE),
         "shift_std": torch.full_like(motion.shift_std, _SHIFT_STD_OF_ONE),
         "shift_time": torch.full_like(motion.shift_time, _SHIFT_TIME_OF_ONE),
+        "scale_cov": _proportions_cov(motion),
     }
-    if lengths_fixed:
-        given["scale_cov"] = torch.diag(std.square())
     return _with(motion, given)
+
+
+def _proportions_cov(motion: BodyMotion) -> Tensor:
+    """Return a share of the covariance of lengths of persons whose legs are equally long."""
+    told = _of_legs(motion)
+    cross = motion.scale_cov @ told
+    cov = motion.scale_cov - cross[:, None] * cross / (told @ cross)
+    cov = _PROPORTIONS_SHARE * cov + _LENGTH_STD**2 * torch.eye(len(cov)).to(cov)
+    return (cov + cov.mT) / 2
+
+
+def _of_legs(motion: BodyMotion) -> Tensor:
+    """Return the weights of the logarithms of lengths whose sum is that of the legs."""
+    legs = [name in ("knee", "ankle") for name in motion.articulation.groups]
+    told = torch.tensor(legs).to(motion.scale_mean)
+    return told / told.sum()
 
 
 def _with(motion: BodyMotion, given: Mapping[str, Tensor]) -> BodyMotion:

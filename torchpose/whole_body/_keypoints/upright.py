@@ -12,22 +12,27 @@ from torchpose.whole_body._body_files import UP_AXES
 
 __all__ = ["Lean", "Upright", "camera_up", "known_up"]
 
-# Of the upward direction in the axes of the pelvis, to the left and forward, rounded from recordings.
-_MEAN, _STD = (0.0, -0.1), (0.1, 0.25)
-_TILT = (0.15, 0.25)  # radians, standard deviations of the roll and pitch of a camera
+# Of the upward direction in the axes of the pelvis, to the left and forward.
+_MEAN, _STD = (0.0, -0.1), (0.08, 0.08)
+_TILT = (0.1, 0.1)  # radians, of the roll and pitch of a camera
+_FREEDOM = 4.0  # degrees of freedom of a lean's t distribution, for people who bend
 
 
 class Lean(NamedTuple):
-    """Holds the gap [B, 2] between expected and actual lean, and its derivative [B, 2, N] by the tangent."""
+    """Holds the gap [B, 2] between expected and actual lean, its variance, and its derivative [B, 2, N]."""
 
     gap: Tensor
+    variance: Tensor
     jacobian: Tensor
 
 
 class Upright(NamedTuple):
-    """Holds the direction that is up [3], world axes, and mean and variance [2] of a pelvis' lean against it.
+    """Holds the direction that is up [3], world axes, and mean and squared scale [2] of a pelvis' lean.
 
-    The lean is the upward direction in the axes of the pelvis, to its left and forward, R^T u.
+    The lean is the upward direction in the axes of the pelvis, to its left and forward, R^T u. It has a t
+    distribution, so that somebody who bends is expected upright with less force:
+
+        variance = s^2 (f + sum_i gap_i^2 / s_i^2) / (f + 2).
     """
 
     direction: Tensor
@@ -43,7 +48,9 @@ class Upright(NamedTuple):
         jacobian = up.new_zeros(*up.shape[:-1], 2, articulation.dim)
         start = articulation.columns["rotations"].start
         jacobian[..., start : start + 3] = turned
-        return Lean(self.mean - torch.stack([x, z], -1), jacobian)
+        gap = self.mean - torch.stack([x, z], -1)
+        far = (gap.square() / self.variance).sum(-1, keepdim=True)
+        return Lean(gap, self.variance * (_FREEDOM + far) / (_FREEDOM + 2), jacobian)
 
 
 def camera_up(rig: CameraRig) -> Upright:
