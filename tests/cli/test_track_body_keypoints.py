@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from tests.cli.test_track_body import HEIGHT, WIDTH, N, arms_rise, looking_at
-from torchpose.body import BODY_15, Body
+from torchpose import BodyTracker
+from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, load_cameras, save_cameras
 from torchpose.cli._body_keypoint_inputs import read_body_keypoints
 from torchpose.io import Keypoints, write_keypoints
@@ -261,6 +262,30 @@ def test_cameras_are_refined_and_written(track, torchpose, scene, tmp_path):
     assert not (tmp_path / "out" / "refined_cameras.toml").exists()  # of an earlier run
 
 
+def test_a_particle_filter_takes_keypoints_as_in_python(track, scene, tmp_path):
+    given = ("--method", "sir", "--n-particles", 60, "--seed", 3, "--height", 1.75)
+    done = track(tmp_path / "out", *MIXED, *given)
+    assert done.code == 0, done.err
+    assert "sir" in done.out and "60" in done.out and "average proportions" in done.out
+    found = BodyTrack.load(tmp_path / "out" / "body.npz")
+    assert (found.method, len(found)) == ("sir", N)
+    assert apart(found, scene[1]) < 0.15
+    assert (tmp_path / "out" / "skeleton.png").exists()
+
+    again = ("--initial-pose", tmp_path / "out" / "body.npz", *PLAIN)
+    assert track(tmp_path / "again", *MIXED, *given, *again).code == 0
+    cameras = list(load_cameras(scene[0] / "cameras.toml").values())
+    read = read_body_keypoints([str(scene[0] / name) for name in MIXED], cameras)
+    tracker = BodyTracker(cameras, "sir", n_particles=60, height=1.75, fps=FPS)
+    start = fit_state(tracker.body, found.joints3d[:1])[0]
+    expected = tracker(
+        None, start, keypoints=read.points, confidence=read.confidence,
+        generator=torch.Generator().manual_seed(3),
+    )  # fmt: skip
+    repeated = BodyTrack.load(tmp_path / "again" / "body.npz")
+    torch.testing.assert_close(repeated.joints3d, expected.joints3d)
+
+
 def test_an_unknown_rate_is_said(track, tmp_path):
     done = track(tmp_path, "front_json", "--camera-names", "[front]", "--height", 1.75, *PLAIN)
     assert (done.code, "no input states a frame rate: 30 fps assumed" in done.out) == (0, True)
@@ -271,10 +296,36 @@ def test_an_unknown_rate_is_said(track, tmp_path):
     [
         (("front_json", "left.csv"), "a camera for each of the 2 inputs"),
         ((*MIXED, "--background", "a.png", "b.png", "c.png"), "--background is for silhouettes"),
-        ((*MIXED, "--manifold", "walk"), "--manifold is for silhouettes"),
-        ((*MIXED, "--n-particles", 300), "--n-particles is for silhouettes"),
+        ((*MIXED, "--manifold", "walk"), "--manifold is for particle filters, and keypoints are"),
+        (
+            (*MIXED, "--n-particles", 300),
+            "--n-particles is for particle filters, and keypoints are",
+        ),
+        ((*MIXED, "--initial-pose", "a.npz"), "--initial-pose is for particle filters"),
         ((*MIXED, "--facing", "[1,0,0]"), "--facing is for silhouettes"),
-        ((*MIXED, "--method", "apf"), "--method apf takes silhouettes of videos"),
+        (
+            (*MIXED, "--method", "apf", "--smoothing", "full"),
+            "--smoothing is for kalman, and --method apf",
+        ),
+        (
+            (*MIXED, "--method", "apf", "--refine", "both"),
+            "--refine is for kalman, and --method apf",
+        ),
+        (
+            (*MIXED, "--method", "sir", "--persons", "all"),
+            "--persons is for kalman, and --method sir",
+        ),
+        (
+            (*MIXED, "--method", "sir", "--motion", "whole-body"),
+            "--motion is for kalman, and --method",
+        ),
+        (
+            (*MIXED, "--method", "sir", "--up", "z"),
+            "--up is for kalman on keypoints and for the files",
+        ),
+        ((*MIXED, "--method", "sir", "--rows", 80), "--rows is for silhouettes"),
+        ((*MIXED, "--method", "mrpf"), "needs manifold"),
+        ((*MIXED, "--method", "ekf"), "ekf"),
         ((*MIXED, "--detector", "a.onnx"), "all inputs are keypoints"),
         ((*MIXED, "--min-confidence", 0.5), "--min-confidence is for --detector"),
         ((*MIXED, "--videos", "front.mp4"), "--videos needs one entry for each of the 3"),
@@ -282,7 +333,7 @@ def test_an_unknown_rate_is_said(track, tmp_path):
         ((*MIXED, "--formats", "fbx"), "--formats must be one of trc, c3d, bvh"),
         (
             ("front.mp4", "left.mp4", "behind.mp4", "--up", "z"),
-            "--up is for keypoints and for the files",
+            "--up is for kalman on keypoints and for the files",
         ),
         ((*MIXED, "--motion", "gone"), "gone"),
         ((*MIXED, "--smoothing", "5"), "--smoothing must be one of none, full"),

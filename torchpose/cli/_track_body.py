@@ -4,6 +4,7 @@ import sys
 import time
 import warnings
 from argparse import ArgumentError
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,6 +15,7 @@ from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible, share_cores
 from torchpose.cli._options import Option, options_of, options_of_methods
 from torchpose.cli._track_body_output import (
+    KALMAN,
     BodyJob,
     Recordings,
     body_results,
@@ -35,6 +37,7 @@ torchpose track-body cameras.toml cam1_json/ cam2_json/ --fps 60 --smoothing ful
 torchpose track-body cameras.toml cam1.npz cam2.csv --videos cam1.mp4 cam2.mp4 --out result
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --refine both --out result
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --persons all --out result
+torchpose track-body cameras.toml cam1_json/ cam2_json/ --method mrpf --manifold walk --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 --detector rtmpose-m.onnx --out result
 torchpose track-body cameras.toml cam*.npz --formats trc c3d bvh --up z --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -51,14 +54,10 @@ PYTHON_ONLY = frozenset({
     "velocity_rate", "max_redraws", "gate_width",
 })  # fmt: skip
 """Options of the shipped filters that only Python has: what the papers' experiments vary."""
-_OF_SILHOUETTES = (
-    "background", "ignore_still", "initial_pose", "facing", "rows", "sharpness", "manifold",
-    "conditionals", "action", "n_particles",
-)  # fmt: skip
-_OF_KEYPOINTS = (
-    "smoothing", "refine", "persons", "videos", "keypoint_std", "pixel_std", "motion", "min_confidence",
-)  # fmt: skip
-_BY_KEYPOINTS = "kalman"
+_OF_SILHOUETTES = ("background", "ignore_still", "facing", "rows", "sharpness")
+_OF_PARTICLES = ("initial_pose", "manifold", "conditionals", "action", "n_particles")
+_OF_KALMAN = ("smoothing", "refine", "persons", "motion")
+_OF_KEYPOINTS = (*_OF_KALMAN, "videos", "keypoint_std", "pixel_std", "min_confidence")
 
 
 def main(arguments: list[str]) -> int:
@@ -84,7 +83,7 @@ def command() -> Command:
         metavars={
             "cameras": "CAMERAS",
             "inputs": "INPUT",
-            "method": "|".join((_BY_KEYPOINTS, *METHODS)),
+            "method": "|".join((KALMAN, *METHODS)),
             "background": "FILE",
             "detector": "FILE|package:factory",
             "formats": "trc|c3d|bvh",
@@ -151,20 +150,20 @@ def run(
         detector: find keypoints in the videos: a model in ONNX (.onnx), a pose landmarker of MediaPipe
             (.task), or package:factory, a Python callable that returns a detector.
         min_confidence: with --detector: of a keypoint, below which it counts as missing (default 0.3).
-        smoothing: keypoints: "full" lets later frames count too.
-        refine: keypoints: estimate the cameras' delays against the first, their poses (extrinsics), or both
+        smoothing: kalman: "full" lets later frames count too.
+        refine: kalman: estimate the cameras' delays against the first, their poses (extrinsics), or both
             from the person who moves, and write refined_cameras.toml.
-        persons: keypoints: track several persons, all or at most N at a time; without it one is followed.
+        persons: kalman: track several persons, all or at most N at a time; without it one is followed.
         videos: keypoints: a video per camera, into which the body is drawn; by default the inputs, if they
             are videos.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
             what stays in a video is its background, so the person has to move about.
         ignore_still: with --background: take what always looks the same in a video for an object that was
             moved since the scene was empty, and not for the person; not if the person stands still.
-        method: of keypoints kalman. The others are particle filters on silhouettes: mrpf, regularised by a
-            manifold (needs --manifold); apf, annealed; sir, plain; root, hypotheses of the root with Gaussian
-            limbs (needs --conditionals); or constrained, to an action (needs --action). By default the one
-            that suits the inputs and the file given, else apf.
+        method: of keypoints kalman, by default. The others are particle filters on silhouettes or keypoints:
+            mrpf, regularised by a manifold (needs --manifold); apf, annealed; sir, plain; root, hypotheses of
+            the root with Gaussian limbs (needs --conditionals); or constrained, to an action (needs
+            --action). Of silhouettes the default is the one that suits the file given, else apf.
         tracker: the arguments of `BodyTracker`.
         initial_pose: a body.npz whose first pose the person begins with; without it, that pose is found.
         facing: the direction in which the person looks at first, in world axes; without it, the first
@@ -178,8 +177,8 @@ def run(
         delays: the number of frames by which each input began too early (default none).
         seed: the seed of the filter; kalman has none.
         formats: also write the poses as body.trc, body.c3d or body.bvh.
-        up: the axis of the cameras' world that points up: by keypoints people are expected upright along
-            it, and the files of --formats have y up. By default they have the axes of the world.
+        up: the axis of the cameras' world that points up: kalman expects people upright along it, and the
+            files of --formats have y up. By default they have the axes of the world.
         overlay: write a video per camera with the body drawn into it.
         pictures: write overlay.png, and of keypoints skeleton.png.
         given: the command.
@@ -198,11 +197,12 @@ def run(
         out, given.files(), tuple(dict.fromkeys(formats or ())), up, overlay,
         pictures_possible(pictures),
     )  # fmt: skip
-    if by_keypoints:
-        return _run_on_keypoints(job, inputs, found, given.values, tracker)
     options = {"sharpness": sharpness, **method_options}
     options = {name: value for name, value in options.items() if value is not None}
-    tracker |= _models(method, tracker, options, initial_pose)
+    if not by_keypoints or _of_particles(method):
+        tracker |= _models(method, tracker, options, initial_pose)
+    if by_keypoints:
+        return _run_on_keypoints(job, inputs, found, given.values, {**tracker, **options})
     with ExitStack() as stack:
         drawn = ["overlay.png"] if job.pictures else []
         results = stack.enter_context(body_results(job, found, overlay, drawn))
@@ -261,51 +261,75 @@ def _run_on_keypoints(
     detector = None
     if values["detector"] is not None:
         detector = DetectorSettings(values["detector"], values["min_confidence"])
-    names = ("body", "height", "keypoint_std", "pixel_std", "motion")
-    arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
+    arguments = tracker
+    if not _of_particles(values["method"]):
+        names = ("body", "height", "keypoint_std", "pixel_std", "motion")
+        arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
     settings = KeypointSettings(
         detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments,
-        values["refine"], values["persons"],
+        values["refine"], values["persons"], values["method"] or KALMAN,
+        values["initial_pose"], values["seed"],
     )  # fmt: skip
     return track_keypoints(job, inputs, cameras, settings)
 
 
+def _of_particles(method: str | None) -> bool:
+    """Return whether keypoints are tracked by a particle filter."""
+    return method not in (None, KALMAN)
+
+
 def _refuse_others(given: Given, by_keypoints: bool) -> None:
     """Raise `InputError` for a method and options that do not go with the inputs."""
-    method, detector = given.values["method"], given.values["detector"]
-    if by_keypoints and method not in (None, _BY_KEYPOINTS):
-        raise InputError(
-            f"--method {method} takes silhouettes of videos, and keypoints are given: they take "
-            f"{_BY_KEYPOINTS}, which needs no --method"
-        )
-    if not by_keypoints and method == _BY_KEYPOINTS:
+    method = given.values["method"]
+    if not by_keypoints and method == KALMAN:
         raise InputError(
             f"--method {method} takes keypoints: .npz, .csv or folders of OpenPose JSON files in place of "
             "videos, or --detector, which finds them"
         )
-    there = "keypoints are given" if by_keypoints else "the inputs are videos without --detector"
-    why = (
-        "silhouettes of videos, which are not computed where" if by_keypoints else "keypoints, and"
-    )
-    refused: tuple[str, ...] = _OF_KEYPOINTS
-    if by_keypoints:
-        refused = (*_OF_SILHOUETTES, *(option.key for option in _method_options()))
-    for key in refused:
-        if given.values[key] != given.defaults[key]:
-            raise InputError(f"--{key.replace('_', '-')} is for {why} {there}; leave it out")
-    if not by_keypoints and given.values["up"] is not None and not given.values["formats"]:
+    if not by_keypoints:
+        _refuse(given, _OF_KEYPOINTS, "keypoints, and the inputs are videos without --detector")
+    else:
+        _refuse_beside_keypoints(given, method)
+    kalman = by_keypoints and not _of_particles(method)
+    if not kalman and given.values["up"] is not None and not given.values["formats"]:
         raise InputError(
-            "--up is for keypoints and for the files of --formats; the other results are in world axes"
+            f"--up is for {KALMAN} on keypoints and for the files of --formats; the other results "
+            "are in world axes"
         )
     if given.values["persons"] is not None and given.values["refine"] != "none":
         raise InputError(
             "--refine is for recordings of one person, and --persons is given; refine the cameras on a "
             "recording of one, and track with its refined_cameras.toml"
         )
-    if by_keypoints and detector is None and given.values["min_confidence"] is not None:
+
+
+def _refuse_beside_keypoints(given: Given, method: str | None) -> None:
+    """Raise `InputError` for options of silhouettes, or of another method than keypoints are tracked by."""
+    _refuse(
+        given, _OF_SILHOUETTES,
+        "silhouettes of videos, which are not computed where keypoints are given",
+    )  # fmt: skip
+    if _of_particles(method):
+        _refuse(given, _OF_KALMAN, f"{KALMAN}, and --method {method} is given")
+    else:
+        options = (*_OF_PARTICLES, *(option.key for option in _method_options()))
+        taken = f"particle filters, and keypoints are tracked by {KALMAN} without another --method"
+        _refuse(given, options, taken)
+    if given.values["detector"] is None and given.values["min_confidence"] is not None:
         raise InputError(
             "--min-confidence is for --detector; confidences of files count as they are"
         )
+
+
+def _refuse(given: Given, keys: Iterable[str], why: str) -> None:
+    """Raise `InputError` for the first of some options that is given.
+
+    Args:
+        given: the command. keys: of the options. why: what they are for, and what is there in its place.
+    """
+    for key in keys:
+        if given.values[key] != given.defaults[key]:
+            raise InputError(f"--{key.replace('_', '-')} is for {why}; leave it out")
 
 
 def _check(values: dict[str, Any]) -> None:
@@ -379,16 +403,10 @@ def _track(
     """Find the person, then track; return None if there is nobody."""
     import torch
 
-    from torchpose.body._fitting import fit_state
-    from torchpose.whole_body._body_track import BodyTrack
+    from torchpose.cli._track_body_keypoints import first_state
 
-    start = None
+    start = first_state(tracker, initial_pose)
     frames = recordings.silhouettes()
-    if initial_pose:
-        recorded = BodyTrack.load(initial_pose)
-        start = fit_state(tracker.body, recorded.joints3d[:1])[0]
-    else:
-        print("finding the pose of the first frame ...", flush=True)
     direction = None if facing is None else torch.tensor(facing, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     with warnings.catch_warnings():

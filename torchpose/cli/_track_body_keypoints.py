@@ -16,7 +16,9 @@ from torchpose.cli._body_keypoint_inputs import (
 )
 from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import (
+    KALMAN,
     BodyJob,
+    action_text,
     body_results,
     draw,
     project_joints,
@@ -37,9 +39,10 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_track import BodyTrack
     from torchpose.whole_body._body_tracker import BodyTracker
 
-__all__ = ["KeypointSettings", "track_keypoints"]
+__all__ = ["KeypointSettings", "first_state", "track_keypoints"]
 
 _CAMERAS = "refined_cameras.toml"
+_FPS = 30.0  # frames per second with which options are checked before inputs are read
 _SAME_RATE = 0.01  # relative: of videos that are not resampled
 
 
@@ -52,6 +55,7 @@ class KeypointSettings(NamedTuple):
         fps: of all inputs, None if they tell. delays: frames by which each began too early.
         tracker: the arguments of `BodyTracker`. refine: what of the cameras is estimated.
         persons: "all", or how many there are at most at a time; None for the one who is followed.
+        method: of tracking. initial_pose, seed: of particle filters, as of the command.
     """
 
     detector: DetectorSettings | None
@@ -62,6 +66,9 @@ class KeypointSettings(NamedTuple):
     tracker: dict[str, Any]
     refine: str = "none"
     persons: str | int | None = None
+    method: str = KALMAN
+    initial_pose: str | None = None
+    seed: int = 0
 
 
 def track_keypoints(
@@ -76,7 +83,9 @@ def track_keypoints(
         job: of the command. inputs: keypoints or videos, for each camera. cameras: calibrated.
         settings: the options.
     """
-    _tracker(cameras, 1.0, settings)  # wrong cameras and options are told before any work
+    _tracker(
+        cameras, settings.fps or _FPS, settings
+    )  # wrong cameras and options are told before any work
     shown = settings.videos
     if shown is None and all(map(is_video, inputs)):
         shown = list(inputs)
@@ -145,23 +154,43 @@ def _tracker(
     cameras: "Sequence[PinholeCamera]", fps: float, settings: KeypointSettings
 ) -> "BodyTracker":
     from torchpose.whole_body._body_tracker import BodyTracker
-    from torchpose.whole_body._keypoints.keypoint_body_tracker import KEYPOINT_METHOD
 
-    return BodyTracker(cameras, KEYPOINT_METHOD, fps=fps, **settings.tracker)
+    return BodyTracker(cameras, settings.method, fps=fps, **settings.tracker)
 
 
 def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "list[BodyTrack]":
     """Return the poses of everybody."""
     tracker = _tracker(keypoints.cameras, keypoints.fps, settings)
+    options: dict[str, Any] = {
+        "persons": settings.persons, "smoothing": settings.smoothing, "refine": settings.refine,
+    }  # fmt: skip
+    if settings.method != KALMAN:
+        import torch
+
+        options = {
+            "initial_state": first_state(tracker, settings.initial_pose),
+            "generator": torch.Generator().manual_seed(settings.seed),
+        }
     try:
         found = tracker(
-            keypoints=keypoints.points, confidence=keypoints.confidence, persons=settings.persons,
-            smoothing=settings.smoothing, refine=settings.refine, progress=show_progress(),
+            keypoints=keypoints.points, confidence=keypoints.confidence, **options,
+            progress=show_progress(),
         )  # fmt: skip
     except NobodySeenError:
         return []
     people = [found] if settings.persons is None else found
     return [replace(poses, notes=(*keypoints.notes, *poses.notes)) for poses in people]
+
+
+def first_state(tracker: "BodyTracker", file: str | None) -> "Tensor | None":
+    """Return the state in which a particle filter begins, of the first pose of a body.npz, or None."""
+    if not file:
+        print("finding the pose of the first frame ...", flush=True)
+        return None
+    from torchpose.body._fitting import fit_state
+    from torchpose.whole_body._body_track import BodyTrack
+
+    return fit_state(tracker.body, BodyTrack.load(file).joints3d[:1])[0]
 
 
 def _facts(
@@ -174,17 +203,22 @@ def _facts(
     source = "files" if settings.detector is None else settings.detector.where
     n_cameras = len(keypoints.cameras)
     everybody = settings.persons is not None
-    agreement = (
-        {"persons": str(len(people)), "detected": _detected(keypoints, people)}
-        if everybody
-        else {"agreement": _agreement(keypoints, people[0])}
-    )
+    agreement = {}
+    if everybody:
+        agreement = {"persons": str(len(people)), "detected": _detected(keypoints, people)}
+    elif settings.method == KALMAN:
+        agreement = {"agreement": _agreement(keypoints, people[0])}
+    else:
+        agreement = {
+            "particles": str(settings.tracker["n_particles"]),
+            "actions": action_text(people[0]),
+        }
     return {
         "keypoints": f"{n_cameras} camera{'s' * (n_cameras > 1)}, {keypoints.fps:g} fps, by {source}",
         "method": people[0].method
         + smoothing_text("full" if settings.smoothing == "full" else None),
-        "body": _body_text(people, settings.tracker),
-        **agreement,
+        "body": _body_text(people, settings),
+        **{name: fact for name, fact in agreement.items() if fact},
         "speed": f"{_count(keypoints, people) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
 
@@ -194,10 +228,13 @@ def _count(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> int:
     return len(people[0]) if len(people) == 1 else len(keypoints.points)
 
 
-def _body_text(people: "Sequence[BodyTrack]", given: dict[str, Any]) -> str:
+def _body_text(people: "Sequence[BodyTrack]", settings: KeypointSettings) -> str:
     """Return whose body it is, or the heights that the bones have."""
+    given = settings.tracker
     if given["body"] is not None:
         return str(given["body"])
+    if settings.method != KALMAN:
+        return f"average proportions, {people[0].body.height:.3g} m"
     known = "" if given["height"] is None else f", {given['height']:g} m given"
     heights = ", ".join(f"{poses.body.height:.2f} m" for poses in people)
     return f"{heights} by {'its' if len(people) == 1 else 'their'} bones{known}"

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_tracker import BodyTracker
 
 __all__ = [
+    "KALMAN",
     "BodyJob",
     "Recordings",
     "action_text",
@@ -33,6 +34,8 @@ __all__ = [
     "write_people",
 ]
 
+KALMAN = "kalman"
+"""The method that takes nothing but keypoints, and is their default."""
 _POSES = ("body.npz", "joints.csv")
 _OWN = (
     r"(body(_p\d\d+)?\.(npz|trc|c3d|bvh)|joints(_p\d\d+)?\.csv|skeleton(_p\d\d+)?\.png)"
