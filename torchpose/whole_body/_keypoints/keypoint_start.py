@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -41,6 +41,7 @@ _WIDTHS = (
     1.0,
     1.0,
 )  # factors of the noise's variance
+_COARSE, _HEADINGS_KEPT = 3, 2  # of these for all headings of one camera, which are then so many
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
 _LOG_ODDS, _DOUBT = -6.0, -5.0
@@ -69,31 +70,61 @@ def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
         filter: that tracks on. frame: the first keypoints, of B persons.
         count: of hypotheses for each person, at most.
     """
+    if len(filter.maps.shift) == 1:
+        return _start_of_one(filter, frame, count)
     maps, body, motion = filter.maps, filter.articulation, filter.motion
-    if len(maps.shift) > 1:
-        joints = triangulate(maps, frame)
-        points = _points(body, motion, maps, joints, _HEADINGS)
-        joints = joints.repeat_interleave(_HEADINGS, 0)
-        points = body.swung(points, joints, joints.isfinite().all(-1))
-        kinds, log_prior = 1, points.position.new_zeros(1)
-        state = filter.pulled(_state(points, _initial_cov(motion)[None], maps), 1.0)
-    else:
-        points = _points(body, motion, maps, _at_one_depth(maps, frame, body), _HEADINGS_OF_ONE)
-        kinds, log_prior = len(motion.poses.weights), motion.poses.weights.log()
-        state = _state(_posed(body, motion, points), _posed_covs(motion), maps)
-    n_each = len(state.scale) // len(frame.pixels)
-    every = torch.arange(len(frame.pixels), device=state.scale.device).repeat_interleave(n_each)
-    found = filter.correct(state, frame.take(every), _WIDTHS)
-    evidence = found.log_evidence.view(len(frame.pixels), -1, kinds) + log_prior
-    if kinds > 1:
-        evidence, heading = evidence.max(1)
-        index = heading * kinds + torch.arange(kinds, device=heading.device)
-    else:
-        evidence = evidence.squeeze(-1)
-        index = torch.arange(n_each, device=every.device).expand_as(evidence)
+    joints = triangulate(maps, frame)
+    points = _points(body, motion, maps, joints, _HEADINGS)
+    joints = joints.repeat_interleave(_HEADINGS, 0)
+    points = body.swung(points, joints, joints.isfinite().all(-1))
+    state = filter.pulled(_state(points, _initial_cov(motion)[None], maps), 1.0)
+    found, evidence = _corrected(filter, state, frame, _WIDTHS)
+    return _likeliest(found, evidence, count)
+
+
+def _start_of_one(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
+    """Return the likeliest hypotheses in one camera: the best heading of every component of the pose prior.
+
+    All headings are corrected with the widest noise, and of every component the best few with all of it.
+    """
+    maps, body, motion = filter.maps, filter.articulation, filter.motion
+    points = _points(body, motion, maps, _at_one_depth(maps, frame, body), _HEADINGS_OF_ONE)
+    log_prior = motion.poses.weights.log()
+    state = _state(_posed(body, motion, points), _posed_covs(motion), maps)
+    kinds = len(log_prior)
+    _, evidence = _corrected(filter, state, frame, _WIDTHS[:_COARSE])
+    best = evidence.unflatten(1, (-1, kinds)).topk(_HEADINGS_KEPT, 1).indices
+    chosen = (best * kinds + _counted(kinds, best)).flatten(1)
+    state = state.take(_rows_of(chosen, evidence.shape[1]))
+    found, evidence = _corrected(filter, state, frame, _WIDTHS)
+    evidence, heading = (evidence.unflatten(1, (-1, kinds)) + log_prior).max(1)
+    found = found.take(_rows_of(heading * kinds + _counted(kinds, heading), _HEADINGS_KEPT * kinds))
+    return _likeliest(found, evidence, count)
+
+
+def _corrected(
+    filter: BodyKalmanFilter, state: BodyGaussian, frame: KeypointFrame, widths: Sequence[float]
+) -> tuple[CorrectedBody, Float[Tensor, "B M"]]:
+    """Return the hypotheses of B persons, the same number of each, corrected, and their log-evidence."""
+    count = len(frame.pixels)
+    every = _counted(count, frame.pixels).repeat_interleave(len(state.scale) // count)
+    found = filter.correct(state, frame.take(every), widths)
+    return found, found.log_evidence.view(count, -1)
+
+
+def _likeliest(found: CorrectedBody, evidence: Float[Tensor, "B M"], count: int) -> Start:
+    """Return so many hypotheses at most, the best first."""
     weights, best = evidence.topk(min(count, evidence.shape[1]), -1)
-    first = torch.arange(len(index), device=index.device)[:, None] * n_each
-    return Start(found.take((first + index.gather(1, best)).flatten()), weights)
+    return Start(found.take(_rows_of(best, evidence.shape[1])), weights)
+
+
+def _rows_of(chosen: Int[Tensor, "B K"], n_each: int) -> Int[Tensor, " N"]:
+    """Return the rows of chosen hypotheses of each of B persons, who have so many each."""
+    return (_counted(len(chosen), chosen)[:, None] * n_each + chosen).flatten()
+
+
+def _counted(count: int, like: Tensor) -> Int[Tensor, " N"]:
+    return torch.arange(count, device=like.device)
 
 
 def _state(points: BodyPoint, covs: Float[Tensor, "#B N N"], maps: RigMaps) -> BodyGaussian:
