@@ -2,7 +2,6 @@
 
 import sys
 import time
-import warnings
 from argparse import ArgumentError
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -21,11 +20,12 @@ from torchpose.cli._track_body_output import (
     body_results,
     draw,
     facts_of,
+    gate_is_in_a_note,
     summary,
     write_page,
     write_people,
 )
-from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, NobodySeenError
+from torchpose.errors import CameraError, InputError, NobodySeenError
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
@@ -409,9 +409,7 @@ def _track(
     frames = recordings.silhouettes()
     direction = None if facing is None else torch.tensor(facing, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
-    with warnings.catch_warnings():
-        # said in a note, with the numbers of the frames
-        warnings.filterwarnings("ignore", "the gate rejected", DegenerateFilterWarning)
+    with gate_is_in_a_note():
         try:
             poses = tracker(
                 frames, start, generator=generator, facing=direction, n_frames=recordings.n_frames,

@@ -21,6 +21,7 @@ from torchpose.cli._track_body_output import (
     action_text,
     body_results,
     draw,
+    gate_is_in_a_note,
     project_joints,
     summary,
     write_page,
@@ -83,9 +84,8 @@ def track_keypoints(
         job: of the command. inputs: keypoints or videos, for each camera. cameras: calibrated.
         settings: the options.
     """
-    _tracker(
-        cameras, settings.fps or _FPS, settings
-    )  # wrong cameras and options are told before any work
+    # wrong cameras and options are told before any work
+    _tracker(cameras, settings.fps or _FPS, settings)
     shown = settings.videos
     if shown is None and all(map(is_video, inputs)):
         shown = list(inputs)
@@ -171,13 +171,14 @@ def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "list[BodyTr
             "initial_state": first_state(tracker, settings.initial_pose),
             "generator": torch.Generator().manual_seed(settings.seed),
         }
-    try:
-        found = tracker(
-            keypoints=keypoints.points, confidence=keypoints.confidence, **options,
-            progress=show_progress(),
-        )  # fmt: skip
-    except NobodySeenError:
-        return []
+    with gate_is_in_a_note():
+        try:
+            found = tracker(
+                keypoints=keypoints.points, confidence=keypoints.confidence, **options,
+                progress=show_progress(),
+            )  # fmt: skip
+        except NobodySeenError:
+            return []
     people = [found] if settings.persons is None else found
     return [replace(poses, notes=(*keypoints.notes, *poses.notes)) for poses in people]
 

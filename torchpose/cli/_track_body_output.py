@@ -1,12 +1,15 @@
 """What `torchpose track-body` reads, writes and prints: videos as silhouettes, poses, pictures, words."""
 
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 from torchpose.cli._track_output import person_suffix
+from torchpose.errors import DegenerateFilterWarning
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -28,6 +31,7 @@ __all__ = [
     "body_results",
     "draw",
     "facts_of",
+    "gate_is_in_a_note",
     "project_joints",
     "summary",
     "write_page",
@@ -414,6 +418,14 @@ def facts_of(
         "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
     return {name: fact for name, fact in facts.items() if fact}
+
+
+@contextmanager
+def gate_is_in_a_note() -> Iterator[None]:
+    """Keep quiet about frames in which the gate of an action lets nobody pass; a note numbers them."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the gate rejected", DegenerateFilterWarning)
+        yield
 
 
 def action_text(poses: "BodyTrack") -> str:
