@@ -274,7 +274,7 @@ def test_shoulders_without_arms_keep_their_width_at_any_distance():
 
 
 def test_lengths_are_reported_with_a_covariance_that_sharpens():
-    track = tracker()(pixels(body(90), 2.0)[None])
+    track = tracker()(pixels(body(240), 2.0)[None])
     assert track.bone_names == ("upper_arm", "forearm_to_hand", "shoulder_width", "head_height")
     usual = shipped_arm_prior()
     rows = [LENGTHS.index(name) for name in track.bone_names]

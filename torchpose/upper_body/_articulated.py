@@ -21,7 +21,6 @@ from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmChain, ArmState, DirectionDensity
 from torchpose.upper_body._articulated_frame import (
-    ArticulatedState,
     Facts,
     RayFrame,
     as_rays,
@@ -51,8 +50,33 @@ from torchpose.upper_body._torso_likelihood import Root
 
 __all__ = ["ArticulatedFilter", "ArticulatedState"]
 
-_SHARE = 0.2  # seconds over which frames say the same about the torso and about lengths
+_SHARE = 0.2  # seconds over which frames say the same about lengths
+_SHARE_OF_TORSO = 0.6  # the same about the torso
+_UPDATE = 0.1  # seconds from one update of the torso to the next
 _AT_ONCE = 32  # frames whose poses are read together
+
+
+class ArticulatedState(NamedTuple):
+    """State of `ArticulatedFilter` between two frames.
+
+    Attributes:
+        root: the belief over size, depth and turn of the torso at its last update, [B, S, Z, P].
+        roots: the hypotheses about these of that update; None before the first frame.
+        lengths: the belief over the lengths of the bones.
+        arms: the belief over the arms; None before the first frame.
+        middle: the middle of the shoulders, camera axes, [B, 3]; on the optical axis before any of the
+            torso was seen.
+        lean: the moments of the line between the shoulders (`seen_lean`), [B, 2].
+        frame: the number of frames before.
+    """
+
+    root: Tensor
+    roots: Roots | None
+    lengths: Lengths
+    arms: ArmState | None
+    middle: Tensor
+    lean: Tensor
+    frame: int
 
 
 class _Seen(NamedTuple):
@@ -145,10 +169,11 @@ class ArticulatedFilter(Estimator):
             lambda: DirectionDensity(self.prior, like.device),
         )
         self.stride = max(1, round(_SHARE * model.rate))
+        self.every = max(1, round(_UPDATE * model.rate))
         self.chain = ArmChain(density, model.rate)
-        self.grid = derived(
-            owner, ("root grid", model.rate), (like,), lambda: RootGrid(model.rate, like)
-        )
+        rate = model.rate / self.every
+        self.power = min(1.0, 1 / (rate * _SHARE_OF_TORSO))
+        self.grid = derived(owner, ("root grid", rate), (like,), lambda: RootGrid(rate, like))
         info, (self.neck_between, self.middle_alone) = model.prior.info, model.middle
         hand = model.hand or info.hand
         neck = "mid-shoulder" if self.middle_alone else info.neck
@@ -160,7 +185,7 @@ class ArticulatedFilter(Estimator):
             lambda: BodyLengths(self.prior, hand, neck, known, like),
         )
         self.matrix = info.matrix.to(like)
-        self.root = RootStep(self.grid, self.chain, self.lengths, self.stride)
+        self.root = RootStep(self.grid, self.chain, self.lengths)
 
     def init(
         self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
@@ -170,7 +195,7 @@ class ArticulatedFilter(Estimator):
         lengths = self.lengths.init(batch_size, self.grid.moments(root).of_size)
         middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
         lean = root.new_zeros(batch_size, 2)
-        return ArticulatedState(root, lengths, None, middle, lean, 0)
+        return ArticulatedState(root, None, lengths, None, middle, lean, 0)
 
     def advance(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
@@ -247,7 +272,10 @@ class ArticulatedFilter(Estimator):
         last = (state.middle[:, None] @ tilt)[:, 0]
         tilted = upright(frame, facts, tilt)
         # the torso: one hypothesis of the root, the mean of those near the likeliest
-        belief, roots = self.root.weigh(state, tilted, last, sizes)
+        belief, roots = state.root, state.roots
+        if roots is None or state.frame % self.every == 0:
+            power = 1.0 if roots is None else self.power
+            belief, roots = self.root.weigh(belief, tilted, last, sizes, power)
         root = roots.mean
         middle = self.root.middle(tilted.torso, root, last, sizes)
         shoulders = shoulder_places(tilted, root, middle, sizes.torso.width)
@@ -266,7 +294,7 @@ class ArticulatedFilter(Estimator):
             roots, root, middle, shoulders,
         )  # fmt: skip
         middle = (middle @ tilt.mT)[:, 0]
-        after = ArticulatedState(belief, learnt, posterior, middle, moments, state.frame + 1)
+        after = ArticulatedState(belief, roots, learnt, posterior, middle, moments, state.frame + 1)
         return _Step(after, seen, posterior)
 
     def _poses(self, found: Sequence[tuple[_Seen, ArmState]]) -> FramePose:

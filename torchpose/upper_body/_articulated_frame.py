@@ -1,4 +1,4 @@
-"""Hold frames as rays, in axes that are rolled with the torso, and the state between two frames."""
+"""Hold frames as rays, in axes that are rolled with the torso."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._arm_chain import ArmState
-from torchpose.upper_body._body_lengths import Lengths
 from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._torso_likelihood import NOT_RAISED, REACH, STIFF_SHOULDER, Torso
@@ -20,7 +18,6 @@ __all__ = [
     "ELBOWS",
     "HANDS",
     "SHOULDERS",
-    "ArticulatedState",
     "Facts",
     "RayFrame",
     "UprightFrame",
@@ -44,27 +41,6 @@ _ROWS = (
 )  # fmt: skip
 _TORSO, _LIMBS, _LIFTS = slice(8, 12), slice(12, 16), slice(16, 18)
 _ENDS = ((False, False), (False, True), (True, False), (True, True))  # measured: elbow, hand
-
-
-class ArticulatedState(NamedTuple):
-    """State of `ArticulatedFilter` between two frames.
-
-    Attributes:
-        root: the belief over size, depth and turn of the torso, [B, S, Z, P].
-        lengths: the belief over the lengths of the bones.
-        arms: the belief over the arms; None before the first frame.
-        middle: the middle of the shoulders, camera axes, [B, 3]; on the optical axis before any of the
-            torso was seen.
-        lean: the moments of the line between the shoulders (`seen_lean`), [B, 2].
-        frame: the number of frames before.
-    """
-
-    root: Tensor
-    lengths: Lengths
-    arms: ArmState | None
-    middle: Tensor
-    lean: Tensor
-    frame: int
 
 
 class RayFrame(NamedTuple):

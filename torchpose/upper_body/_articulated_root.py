@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpose.math._rotations import within_half_turn
 from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import ArmChain, ArmInput, Arms, mirrored
-from torchpose.upper_body._articulated_frame import ArticulatedState, UprightFrame
+from torchpose.upper_body._articulated_frame import UprightFrame
 from torchpose.upper_body._articulated_poses import bones_of
 from torchpose.upper_body._articulated_torso import shoulder_places
 from torchpose.upper_body._body_lengths import BodyLengths, Sizes
@@ -61,27 +61,29 @@ class RootStep(NamedTuple):
     Attributes:
         grid: the point-mass filter over size, depth and turn. chain: the point-mass filter over the arms.
         lengths: the filter of the lengths of bones.
-        stride: the number of frames that count as one, since they are alike.
     """
 
     grid: RootGrid
     chain: ArmChain
     lengths: BodyLengths
-    stride: int
 
     def weigh(
-        self, state: ArticulatedState, frame: UprightFrame, last: Tensor, sizes: Sizes
+        self,
+        belief: Float[Tensor, "B S Z P"],
+        frame: UprightFrame,
+        last: Tensor,
+        sizes: Sizes,
+        power: float,
     ) -> tuple[Float[Tensor, "B S Z P"], Roots]:
         """Return the posterior over the grid and the likeliest hypotheses.
 
         Args:
-            state: the state before the frame. frame: the measurements, in tilted axes.
+            belief: the belief at the last update. frame: the measurements, in tilted axes.
             last: the middle of the shoulders in the frame before, in the same axes, [B, 3].
-            sizes: the lengths of the bones.
+            sizes: the lengths of the bones. power: the exponent of the likelihood.
         """
-        power = 1.0 if state.arms is None else 1 / self.stride
         likelihood = self.grid.likelihood(frame.torso, sizes.torso, power)
-        believed = self.grid.predict(state.root) * likelihood
+        believed = self.grid.predict(belief) * likelihood
         if frame.face is not None:
             std = frame.given.std.amin(1)
             of_face = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
