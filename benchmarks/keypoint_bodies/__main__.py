@@ -8,8 +8,10 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
 
     python -m benchmarks.keypoint_bodies --data DIR [--out FILE] [--methods NAME ...] [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
+    python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
-The second line prints what the constants of the filters of single joints were chosen by.
+The second line prints what the constants of the filters of single joints were chosen by. The third fits the
+network that comes with torchpose and corrects poses in one camera.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from benchmarks.keypoint_bodies.clips import (
     read_clips,
     read_kinect,
 )
+from benchmarks.keypoint_bodies.lifting import fit_shipped
 from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, methods_of
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.tables import add_table
@@ -50,6 +53,7 @@ def main(
     threads: int = 2,
     out: TableFile | None = None,
     choose: bool = False,
+    fit: Path | None = None,
     quick: bool = False,
 ) -> None:
     """Print the tables.
@@ -61,9 +65,13 @@ def main(
         threads: cores.
         out: file for the same as Markdown, or a folder.
         choose: print the errors of several constants on the clips for that, in place of the tables.
+        fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
     """
     torch.set_num_threads(threads)
+    if fit is not None:
+        fit_shipped(data, quick).save(fit)
+        return
     report = Report("Whole bodies from keypoints")
     names = CHOOSING if choose else SCORED
     if quick:

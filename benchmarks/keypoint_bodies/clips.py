@@ -207,11 +207,16 @@ def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iter
         yield clip.cut(start, start + longest)
 
 
-def see(clip: MocapClip, seed: int = 0, faults: Faults = FAULTS) -> Clip:
-    """Return a recording in a ring of cameras that its name and the seed draw."""
+def see(clip: MocapClip, seed: int = 0, faults: Faults = FAULTS, turn: float = 0.0) -> Clip:
+    """Return a recording in a ring of cameras that its name and the seed draw.
+
+    Args:
+        clip: the recording. seed: of the cameras and faults. faults: of the detector. turn: of the ring,
+            degrees.
+    """
     generator = torch.Generator().manual_seed(int(settings_hash([clip.trial, seed])[:8], 16))
     joints, up = clip.joints.double(), clip.up.double()
-    rig = draw_ring(joints, up, generator)
+    rig = draw_ring(joints, up, generator, turn)
     pixels = rig(joints).pixels
     return Clip(clip.trial, clip.fps, joints, up, rig, detect(pixels, generator, faults))
 
@@ -226,7 +231,10 @@ def begun(clip: Clip, frames: int = _QUICK_FRAMES) -> Clip:
 
 
 def draw_ring(
-    joints: Float[Tensor, "T 15 3"], up: Float[Tensor, "3"], generator: torch.Generator
+    joints: Float[Tensor, "T 15 3"],
+    up: Float[Tensor, "3"],
+    generator: torch.Generator,
+    turn: float = 0.0,
 ) -> CameraRig:
     """Return four cameras around the middle of a path, at which they look.
 
@@ -234,7 +242,8 @@ def draw_ring(
     middle and at least 2 m from every place of the pelvis. The focal length keeps all joints in view.
 
     Args:
-        joints: of the recording. up: of the room. generator: of places.
+        joints: of the recording. up: of the room. generator: of places. turn: of the ring from there,
+            degrees.
     """
     path = joints[:, _PELVIS]
     middle = (path.amin(0) + path.amax(0)) / 2
@@ -244,8 +253,8 @@ def draw_ring(
     forward = torch.linalg.cross(left, up)
     drawn = torch.rand(len(_AZIMUTHS), 3, generator=generator, dtype=torch.float64)
     cameras = []
-    for i, (azimuth, (turn, away, high)) in enumerate(zip(_AZIMUTHS, drawn, strict=True), 1):
-        angle = torch.deg2rad(azimuth + _JITTER * (2 * turn - 1))
+    for i, (azimuth, (off, away, high)) in enumerate(zip(_AZIMUTHS, drawn, strict=True), 1):
+        angle = torch.deg2rad(azimuth + turn + _JITTER * (2 * off - 1))
         ray = angle.cos() * forward + angle.sin() * left
         reach = ((path - middle) @ ray).max()
         distance = torch.maximum(_between(_DISTANCE, away), reach + _NEAREST)

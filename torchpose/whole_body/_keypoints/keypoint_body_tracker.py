@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -35,6 +34,8 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointTracker,
 )
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
+from torchpose.whole_body._keypoints.lifted_pose import PoseLifter
+from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import known_up
 
 __all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker"]
@@ -59,6 +60,7 @@ class KeypointBodyTracker(nn.Module):
         keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
         pixel_std: pixels, how far they are apart from that; None is the usual, of both.
         up: "y" or "z", the axis of the world that points up, if it is known.
+        lifting: whether a network corrects the poses in one camera.
 
     Raises:
         InputError: values out of range. CameraError: cameras farther away than any room is large.
@@ -75,6 +77,7 @@ class KeypointBodyTracker(nn.Module):
         keypoint_std: float | None = None,
         pixel_std: float | None = None,
         up: str | None = None,
+        lifting: bool = True,
     ) -> None:
         super().__init__()
         self.rig, self.fps = rig, float(fps)
@@ -99,7 +102,10 @@ class KeypointBodyTracker(nn.Module):
         self.sized = body is not None or height is not None
         lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
         known = None if up is None else known_up(rig, up)
-        self.tracker = KeypointTracker(rig, self.fps, motion, upright=known, lasting_std=lasting)
+        lifter = PoseLifter(rig, self.fps, motion) if alone and lifting else None
+        self.tracker = KeypointTracker(
+            rig, self.fps, motion, upright=known, lasting_std=lasting, lifter=lifter
+        )
 
     @torch.no_grad()
     def forward(
@@ -329,7 +335,5 @@ def _rigid_body(bones: Float[Tensor, "T J 3"]) -> Body:
 
 def _with_time(pose: KeypointPoses) -> KeypointPoses:
     """Return the poses of one frame as those of a sequence of one."""
-    fields: dict[str, Any] = {
-        name: value[:, None] for name, value in pose._asdict().items() if name != "point"
-    }
-    return KeypointPoses(point=pose.point.map(lambda value: value[:, None]), **fields)
+    with_time: KeypointPoses = mapped(lambda value: value[:, None], pose)
+    return with_time

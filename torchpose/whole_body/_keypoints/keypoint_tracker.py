@@ -21,6 +21,8 @@ from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.depth_flips import flip
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, corrected_by, nothing_lifted
+from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
@@ -45,6 +47,7 @@ class KeypointStream(NamedTuple):
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
         begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
             been of something else, or has waited for a start. age: [B], frames since tracking began.
+        memory: [B, L, W], of the network that lifts keypoints of one camera; empty without it.
     """
 
     state: BodyGaussian
@@ -52,6 +55,7 @@ class KeypointStream(NamedTuple):
     begun: Tensor
     lost: Tensor
     age: Tensor
+    memory: Tensor
 
 
 class KeypointPoses(NamedTuple):
@@ -62,7 +66,7 @@ class KeypointPoses(NamedTuple):
         point: the states, on the manifold. state_cov: [..., N, N], in their tangent spaces.
         inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of
             arms, of legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...],
-            where tracking began.
+            where tracking began. lifted: what a network found in one camera.
     """
 
     joints: Tensor
@@ -74,6 +78,7 @@ class KeypointPoses(NamedTuple):
     log_evidence: Tensor
     coasting: Tensor
     started: Tensor
+    lifted: Lifted
 
 
 class KeypointTracker(nn.Module):
@@ -84,6 +89,7 @@ class KeypointTracker(nn.Module):
         upright: how people lean, if it is known which way is up; with one camera, this is taken to be level.
         lasting_std: metres, of what is wrong with joints for so long that frames do not average it out, along
             each axis; covariances of joints have it on top.
+        lifter: of the keypoints of one camera, which corrects the poses that are returned.
     """
 
     def __init__(
@@ -94,9 +100,10 @@ class KeypointTracker(nn.Module):
         n_iterations: int = 3,
         upright: Upright | None = None,
         lasting_std: float = 0.0,
+        lifter: PoseLifter | None = None,
     ) -> None:
         super().__init__()
-        self.lasting_std = lasting_std
+        self.lasting_std, self.lifter = lasting_std, lifter
         if upright is None and len(rig) == 1:
             upright = camera_up(rig)
         self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
@@ -151,12 +158,13 @@ class KeypointTracker(nn.Module):
         chosen = self._merged(stream, found)
         inlier = chosen.weighed.own + chosen.weighed.other
         stream = stream._replace(lost=self._lost(stream, frame, chosen.weighed))
+        stream, lifted = self._lifted(stream, frame, chosen.joints)
         pose = KeypointPoses(
-            chosen.joints, self._lasting(chosen.joint_cov), chosen.state.mean, chosen.state.cov, inlier,
+            chosen.joints, chosen.joint_cov, chosen.state.mean, chosen.state.cov, inlier,
             chosen.weighed.exchanged, chosen.log_evidence,
-            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough,
+            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough, lifted,
         )  # fmt: skip
-        return stream, pose, chosen
+        return stream, self._reported(pose), chosen
 
     def _enough(self, frame: KeypointFrame, waited: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
         """Return whether tracking may begin: two cameras see the same joints, or have not for long."""
@@ -209,7 +217,8 @@ class KeypointTracker(nn.Module):
         zero = weights.new_zeros(count)
         begun = torch.ones(count, dtype=torch.bool, device=weights.device)
         weights = _SHARE * (weights - weights[:, :1])
-        return KeypointStream(found.state, weights, begun, zero, zero.long()), found
+        nothing = weights.new_zeros(count, 0, 0)
+        return KeypointStream(found.state, weights, begun, zero, zero.long(), nothing), found
 
     def _begun_anew(
         self,
@@ -229,8 +238,31 @@ class KeypointTracker(nn.Module):
             stream.begun | due,
             torch.where(due, 0.0, stream.lost),
             torch.where(due, 0, stream.age),
+            stream.memory,
         )
         return stream, found.put(rows, new_found)
+
+    def _lifted(
+        self, stream: KeypointStream, frame: KeypointFrame, joints: Float[Tensor, "B J 3"]
+    ) -> tuple[KeypointStream, Lifted]:
+        """Return the stream with its memory of the frame, and what the network lifts in it."""
+        if self.lifter is None:
+            return stream, nothing_lifted(joints)
+        lifted, memory = self.lifter(frame, stream.memory if stream.memory.numel() else None)
+        return stream._replace(memory=memory), lifted
+
+    def _reported(self, poses: KeypointPoses) -> KeypointPoses:
+        """Return the poses as they are reported: corrected by what was lifted, with errors that last."""
+        if self.lifter is None:
+            return poses._replace(covariance=self._lasting(poses.covariance))
+        body, batch = self.filter.articulation, poses.coasting.shape
+        states = (poses.lifted, poses.point, poses.state_cov)
+        lifted, mean, cov = mapped(lambda value: value.flatten(0, len(batch) - 1), states)
+        point = corrected_by(lifted, body, mean, cov)
+        point = point.map(lambda value: value.unflatten(0, batch))
+        joints, jacobian = body.linearise(point)
+        joint_cov = (jacobian @ poses.state_cov.unsqueeze(-3)) @ jacobian.mT
+        return poses._replace(joints=joints, covariance=self._lasting(joint_cov), point=point)
 
     def _merged(self, stream: KeypointStream, found: CorrectedBody) -> CorrectedBody:
         """Return the Gaussian with the mean and covariance of all hypotheses, in the likeliest one's tangent.
@@ -293,8 +325,8 @@ class KeypointTracker(nn.Module):
         cov = result.cov.transpose(0, 1)
         joints, jacobian = self.filter.articulation.linearise(point)
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
-        return filtered._replace(
-            joints=joints, covariance=self._lasting(joint_cov), point=point, state_cov=cov
+        return self._reported(
+            filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
         )
 
     def _lasting(self, joint_cov: Float[Tensor, "*batch J 3 3"]) -> Float[Tensor, "*batch J 3 3"]:

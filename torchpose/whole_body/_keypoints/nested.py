@@ -1,4 +1,4 @@
-"""Apply functions to all tensors of named tuples, and of named tuples in them."""
+"""Apply functions to all tensors of tuples, and of tuples in them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,15 +9,16 @@ __all__ = ["mapped", "taken"]
 
 
 def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
-    """Return a named tuple of what a function makes of each entry, and of the same entry of the others.
+    """Return a tuple of what a function makes of each entry, and of the same entry of the others.
 
     Args:
-        fn: of as many entries as there are tuples. first: a named tuple, or an entry by itself.
-        others: named tuples of the same kind.
+        fn: of as many entries as there are tuples. first: a tuple, or an entry by itself.
+        others: tuples of the same kind.
     """
     if not isinstance(first, tuple):
         return fn(first, *others)
-    return type(first)(*(mapped(fn, *parts) for parts in zip(first, *others, strict=True)))
+    values = (mapped(fn, *parts) for parts in zip(first, *others, strict=True))
+    return type(first)(*values) if hasattr(first, "_fields") else tuple(values)
 
 
 def taken(value: Any, index: Tensor) -> Any:
