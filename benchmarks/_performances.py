@@ -1,4 +1,4 @@
-"""Generate movements for rendered benchmarks: hands that sign, clap, merge, cross, rise; crossing persons.
+"""Generate movements for rendered benchmarks: signing, clapping, merging hands, crossing persons.
 
 Key frames are places of the hands in the torso's axes, metres; the arms follow by inverse kinematics.
 Movements are random, so that every seed gives another sequence.
@@ -17,9 +17,7 @@ from torchpose.errors import InputError
 
 __all__ = ["PERFORMANCES", "crossing", "performance"]
 
-PERFORMANCES = (
-    "performer", "signing", "clapping", "merging hands", "crossed arms", "raised arms"
-)  # fmt: skip
+PERFORMANCES = ("performer", "signing", "clapping", "merging hands")
 """Names that `performance` takes."""
 
 Place = tuple[float, float, float]
@@ -87,13 +85,7 @@ def performance(
         raise InputError(f"need n_frames >= 1 and fps > 0, got {n_frames} and {fps}")
     if name == "performer":
         return performer(n_frames, fps, seed, size, distance)
-    make = {
-        "signing": _sign,
-        "clapping": _clap,
-        "merging hands": _merge,
-        "crossed arms": _cross,
-        "raised arms": _raise,
-    }[name]
+    make = {"signing": _sign, "clapping": _clap, "merging hands": _merge}[name]
     rng = np.random.default_rng([seed, PERFORMANCES.index(name)])
     keys = _Keys.begin()
     keys.stay(0.6)
@@ -205,68 +197,6 @@ def _merge(keys: _Keys, rng: np.random.Generator) -> None:
         keys.go("apart", *apart, pace)
     if rng.random() < 0.4:
         keys.rest(rng.uniform(0.2, 0.6))
-
-
-def _cross(keys: _Keys, rng: np.random.Generator) -> None:
-    """Add arms that are folded, clasped, or reach across, or a hand at the face above the other one."""
-    u = rng.uniform
-    kind = str(rng.choice(["folded", "at the face", "across", "clasped", "apart"]))
-    if kind == "folded":
-        front = 0.06 * rng.choice([-1, 1])
-        hands = (
-            (-u(0.08, 0.2), u(0.12, 0.36), front - 0.26),
-            (u(0.08, 0.2), u(0.12, 0.36), -front - 0.26),
-        )
-    elif kind == "at the face":
-        hands = (u(-0.05, 0.08), -u(0.06, 0.2), -0.25), (u(0.0, 0.14), u(0.3, 0.5), -0.24)
-    elif kind == "across":
-        hands = (-u(0.1, 0.2), u(0.1, 0.36), -0.34), (-u(0.15, 0.25), u(0.45, 0.58), -0.16)
-    elif kind == "clasped":
-        x, y, z = u(-0.05, 0.05), u(0.3, 0.56), u(-0.3, -0.2)
-        hands = (x + 0.035, y, z), (x - 0.035, y + u(-0.03, 0.03), z)
-    else:
-        hands = tuple((side * u(0.25, 0.45), u(0.0, 0.4), -u(0.14, 0.4)) for side in (1, -1))
-    left, right = hands
-    if rng.random() < 0.5:
-        left, right = _mirror(right), _mirror(left)
-    wide = u(0.2, 0.3), u(0.15, 0.4), -0.34  # between two of these, so that arms do not meet
-    keys.go("apart", wide, _mirror(wide), u(0.4, 0.7))
-    keys.go(kind, left, right, u(0.5, 1.0))
-    keys.stay(u(0.2, 1.6))
-    if rng.random() < 0.3:
-        keys.rest(u(0.2, 0.6))
-
-
-def _raise(keys: _Keys, rng: np.random.Generator) -> None:
-    """Add arms, one or both, that rise beside or above the head or are held out."""
-    u = rng.uniform
-    kinds = ("above", "beside the head", "to the side", "to the front")
-    kind = str(rng.choice(kinds, p=[0.4, 0.2, 0.25, 0.15]))
-
-    def place() -> Place:
-        return {
-            "above": (u(0.2, 0.4), -u(0.2, 0.36), -u(0.1, 0.2)),
-            "beside the head": (u(0.26, 0.4), u(-0.2, 0.0), -u(0.12, 0.25)),
-            "to the side": (u(0.45, 0.6), u(-0.05, 0.3), -u(0.1, 0.25)),
-            "to the front": (u(0.1, 0.3), u(0.0, 0.3), -u(0.36, 0.46)),
-        }[kind]
-
-    beside = 0.36, 0.3, -0.28  # where arms pass by, whose elbows would turn over else
-    left, right = place(), _mirror(place())
-    which = rng.choice(["both", "left", "right"], p=[0.5, 0.25, 0.25])
-    path = [(beside, _mirror(beside)), (left, right), (beside, _mirror(beside))]
-    for hands, seconds in zip(path, (u(0.5, 0.8), u(0.6, 1.0), u(0.6, 1.0)), strict=True):
-        rests = _REST, _mirror(_REST)
-        keys.go(
-            kind,
-            rests[0] if which == "right" else hands[0],
-            rests[1] if which == "left" else hands[1],
-            seconds,
-        )
-        if hands == path[1]:
-            keys.stay(u(0.2, 1.2))
-    if rng.random() < 0.3:
-        keys.rest(u(0.2, 0.6))
 
 
 _AT_FACE = ((0.05, -0.05, -0.24), (0.10, -0.13, -0.22), (0.10, -0.21, -0.22), (0.03, -0.06, -0.25))

@@ -14,7 +14,7 @@ from benchmarks.hand_network.changes import bare_skin, bordered, exchanged, lit,
 from benchmarks.hand_network.clips import Windows
 from torchpose.measure._hand_network import COARSE, HandNetwork, HandNetworkInfo, relative_colours
 
-STEPS, BATCH, _RATE, _DECAY = 1500, 16, 3e-3, 1e-2
+STEPS, BATCH, _RATE, _DECAY = 900, 16, 3e-3, 1e-2
 _BLUR = 0.9  # coarse cells: of a label
 _HANDS, _ELBOWS = slice(0, 2), slice(2, 4)  # of the labelled joints
 _SHARE_OF_ELBOWS = 2 / 3  # of the steps of the hands

@@ -344,12 +344,10 @@ class HandTracker(nn.Module):
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()
-        exclusion, crossing = s.exclusion, s.crossing
-        if self.network is not None:
-            exclusion, crossing = s.exclusion_beside_network, s.crossing_beside_network
+        exclusion = s.exclusion if self.network is None else s.exclusion_beside_network
         return exclude(
             predicted * weight,
-            exclusion, s.exclusion_radius / CELL, crossing, s.crossing_soft / CELL,
+            exclusion, s.exclusion_radius / CELL, s.crossing, s.crossing_soft / CELL,
         )  # fmt: skip
 
     def _measure(
