@@ -24,6 +24,7 @@ from benchmarks.keypoint_bodies.clips import (
 )
 from benchmarks.keypoint_bodies.joint_filters import project_one
 from benchmarks.keypoint_bodies.lifters import placed
+from benchmarks.keypoint_bodies.lifting import fit_shipped
 from benchmarks.keypoint_bodies.methods import METHODS, OURS
 from benchmarks.keypoint_bodies.real import predicted, read_filmed
 from benchmarks.keypoint_bodies.scoring import Estimate, bone_spread, score
@@ -36,6 +37,7 @@ from benchmarks.keypoint_bodies.triangulation import (
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.demo._rendering.walk import walk, walk_clip
+from torchpose.whole_body._keypoints.lifting_network import LiftingNetwork
 
 PEERS = [name for name in METHODS if name not in OURS]
 
@@ -197,3 +199,19 @@ def test_quick_run_prints_every_peer(run_here, tmp_path):
     assert printed.count("| gru * |") == 3
     assert "persons of a Kinect" in printed
     assert (tmp_path / "keypoint_bodies.md").read_text().split() == printed.split()
+
+
+def test_turned_rings_see_the_same_body_from_other_sides(walker):
+    ahead, beside = (see(walker, faults=CLEAN, turn=turn) for turn in (0.0, 90.0))
+    first, second = (clip.rig.rotation[0, 2] for clip in (ahead, beside))
+    angle = math.degrees(math.acos(float(first @ second)))
+    assert 60 < angle < 110
+    torch.testing.assert_close(ahead.joints, beside.joints)
+
+
+def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_size(tmp_path):
+    data = data_dir_or_skip(WALKS).parent
+    fit_shipped(data, quick=True).save(tmp_path / "lifting.safetensors")
+    network = LiftingNetwork.load(tmp_path / "lifting.safetensors")
+    assert network.info.recordings == ("mocap_cmu_walk/s02_*",)
+    assert 0.6 < network.info.legs < 1.0
