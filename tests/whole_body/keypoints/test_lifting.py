@@ -167,6 +167,13 @@ def test_steps_are_corrected_as_whole_sequences_are():
         torch.testing.assert_close(pose.joints3d[0], whole.joints3d[t])
 
 
+def test_a_module_in_double_precision_lifts_the_same():
+    one = scene(1, 3)
+    given = {"keypoints": one.keypoints, "confidence": one.confidence, "names": NAMES}
+    single, double = tracker()(**given), tracker().double()(**given)
+    torch.testing.assert_close(single.joints3d, double.joints3d, atol=1e-4, rtol=0)
+
+
 def test_several_cameras_and_particle_filters_lift_nothing():
     assert torchpose.BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints.tracker.lifter is None
     assert tracker(lifting=False).by_keypoints.tracker.lifter is None

@@ -75,7 +75,8 @@ class PoseLifter(nn.Module):
         """
         sure = frame.inlier[:, 0]
         rays = (frame.pixels[:, 0] - self.matrix[:2, 2]) / self.matrix.diagonal()[:2]
-        lifted, memory = self.network(lifting_features(rays, sure, self.fps)[:, None], memory)
+        seen = lifting_features(rays, sure, self.fps).to(self.network.places.weight)
+        lifted, memory = self.network(seen[:, None], memory)
         joints, std = (self.size * value[:, 0].to(rays) for value in lifted)
         enough = (sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS
         return Lifted(joints @ self.rotation, torch.where(enough, std, torch.inf)), memory
