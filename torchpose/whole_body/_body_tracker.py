@@ -193,8 +193,8 @@ class BodyTracker(nn.Module):
             )  # fmt: skip
             self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return
-        of_kalman = (("motion", motion), ("up", up), ("lifting", None if lifting else lifting))
-        unused = [name for name, value in of_kalman if value is not None]
+        unused = [name for name, value in (("motion", motion), ("up", up)) if value is not None]
+        unused += ["lifting"] * (not lifting)
         if unused:
             raise InputError(
                 f"{', '.join(unused)} does nothing without method={KEYPOINT_METHOD!r}; leave it out"

@@ -38,11 +38,12 @@ from torchpose.whole_body._keypoints.lifted_pose import PoseLifter
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import known_up
 
-__all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker"]
+__all__ = ["INLIER", "KEYPOINT_METHOD", "KeypointBodyTracker"]
 
 KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
-_INLIER = (0.05, 0.97)  # least and largest prior probability that a keypoint is its joint's
+INLIER = (0.05, 0.97)
+"""Least and largest prior probability that a keypoint is its joint's."""
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
@@ -222,7 +223,7 @@ class KeypointBodyTracker(nn.Module):
             if not bool((own[trust > 0] > 0).all()):
                 raise InputError("covariance must be positive, pixels squared")
         there = torch.isfinite(points).all(-1) & (trust > 0)
-        inlier = torch.where(there, trust.clamp(*_INLIER), 0.0)
+        inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
         table = body_joints(table.masked_fill(~there[..., None], torch.nan), names)
         pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)

@@ -23,7 +23,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, corrected_by, nothing_lifted
 from torchpose.whole_body._keypoints.lifting_network import Lifted
-from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
 __all__ = ["LEAST_JOINTS", "KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
@@ -38,6 +38,7 @@ _FLIP_TIME = 0.1  # seconds after which a limb is mirrored in depth
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, without which it has no distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
+_AT_ONCE = 256  # poses that are corrected together: derivatives of many fill the memory
 
 
 class KeypointStream(NamedTuple):
@@ -122,12 +123,12 @@ class KeypointTracker(nn.Module):
         poses, corrected = [], []
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
             frame = frames.map(lambda value: value[:, t])  # noqa: B023
-            stream, pose, found = self.advance(stream, frame)
+            stream, pose, found = self._advanced(stream, frame)
             poses.append(pose)
             if smoothing:
                 corrected.append(found)
         filtered = stacked(poses)
-        return self.smoothed(filtered, corrected) if smoothing else filtered
+        return self.smoothed(filtered, corrected) if smoothing else self._reported(filtered)
 
     def advance(
         self,
@@ -144,6 +145,16 @@ class KeypointTracker(nn.Module):
         Returns:
             The next stream, the poses of the frame [B, ...], and the corrected hypotheses as one Gaussian.
         """
+        stream, pose, found = self._advanced(stream, frame, predicted)
+        return stream, self._reported(pose), found
+
+    def _advanced(
+        self,
+        stream: KeypointStream | None,
+        frame: KeypointFrame,
+        predicted: BodyGaussian | None = None,
+    ) -> tuple[KeypointStream, KeypointPoses, CorrectedBody]:
+        """Return what `advance` does, with poses as the filter has them."""
         waited = frame.inlier.new_zeros(len(frame.inlier)) if stream is None else stream.lost
         enough = self._enough(frame, waited)
         if stream is None:
@@ -164,7 +175,7 @@ class KeypointTracker(nn.Module):
             chosen.weighed.exchanged, chosen.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough, lifted,
         )  # fmt: skip
-        return stream, self._reported(pose), chosen
+        return stream, pose, chosen
 
     def _enough(self, frame: KeypointFrame, waited: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
         """Return whether tracking may begin: two cameras see the same joints, or have not for long."""
@@ -257,9 +268,13 @@ class KeypointTracker(nn.Module):
             return poses._replace(covariance=self._lasting(poses.covariance))
         body, batch = self.filter.articulation, poses.coasting.shape
         states = (poses.lifted, poses.point, poses.state_cov)
-        lifted, mean, cov = mapped(lambda value: value.flatten(0, len(batch) - 1), states)
-        point = corrected_by(lifted, body, mean, cov)
-        point = point.map(lambda value: value.unflatten(0, batch))
+        flat = mapped(lambda value: value.flatten(0, len(batch) - 1), states)
+        rows = torch.arange(math.prod(batch), device=poses.coasting.device).split(_AT_ONCE)
+        points = [
+            corrected_by(lifted, body, mean, cov)
+            for lifted, mean, cov in (taken(flat, part) for part in rows)
+        ]
+        point = mapped(lambda *values: torch.cat(values).unflatten(0, batch), *points)
         joints, jacobian = body.linearise(point)
         joint_cov = (jacobian @ poses.state_cov.unsqueeze(-3)) @ jacobian.mT
         return poses._replace(joints=joints, covariance=self._lasting(joint_cov), point=point)

@@ -11,8 +11,9 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.errors import SkeletonError
 from torchpose.priors._body_motion import BodyMotion
 
-__all__ = ["of_one_camera", "with_body", "with_height"]
+__all__ = ["length_of_legs", "of_one_camera", "with_body", "with_height"]
 
+_LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
 _PROPORTIONS_SHARE = 0.3  # of the variance of proportions over persons
 _SHIFT_STD_OF_ONE, _SHIFT_TIME_OF_ONE = 0.015, 0.5  # metres, seconds
@@ -71,9 +72,17 @@ def _proportions_cov(motion: BodyMotion) -> Tensor:
     return (cov + cov.mT) / 2
 
 
+def length_of_legs(motion: BodyMotion) -> float:
+    """Return the expected length of thigh and shank, metres."""
+    body = motion.articulation
+    lengths = body.offsets.norm(dim=-1) * motion.scale_mean[body.group].exp().to(body.offsets)
+    legs = [j for j, name in enumerate(BODY_15.names) if name.endswith(_LEGS)]
+    return float(lengths[legs].sum()) / 2
+
+
 def _of_legs(motion: BodyMotion) -> Tensor:
     """Return the weights of the logarithms of lengths whose sum is that of the legs."""
-    legs = [name in ("knee", "ankle") for name in motion.articulation.groups]
+    legs = [name in _LEGS for name in motion.articulation.groups]
     told = torch.tensor(legs).to(motion.scale_mean)
     return told / told.sum()
 

@@ -24,6 +24,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.known_person import length_of_legs
 from torchpose.whole_body._keypoints.lifting_network import (
     Lifted,
     LiftingNetwork,
@@ -37,7 +38,6 @@ _FACTOR = 2.0  # on the network's standard deviations
 _ITERATIONS = 3
 _LEAST_JOINTS = 6  # keypoints without which a frame is not lifted
 _PELVIS = BODY_15.joint("pelvis")
-_LEGS = ("knee", "ankle")
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
 
 
@@ -59,7 +59,7 @@ class PoseLifter(nn.Module):
         super().__init__()
         self.network = copy.deepcopy(network or shipped_lifting_network())
         self.fps = fps
-        self.size = _legs(motion) / self.network.info.legs
+        self.size = length_of_legs(motion) / self.network.info.legs
         self.register_buffer("matrix", rig.matrix[0].clone(), persistent=False)
         self.register_buffer("rotation", rig.rotation[0].clone(), persistent=False)
         self.matrix: Tensor
@@ -111,11 +111,3 @@ def corrected_by(
         d = (HP.mT @ torch.cholesky_solve(wanted, chol)).squeeze(-1)
         point = body.moved(mean, d)
     return body.swung(point, body.joints(point))
-
-
-def _legs(motion: BodyMotion) -> float:
-    """Return the expected length of thigh and shank, metres."""
-    body = motion.articulation
-    lengths = body.offsets.norm(dim=-1) * motion.scale_mean[body.group].exp().to(body.offsets)
-    legs = [j for j, name in enumerate(BODY_15.names) if name.endswith(_LEGS)]
-    return float(lengths[legs].sum()) / 2
