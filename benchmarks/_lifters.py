@@ -11,11 +11,11 @@ the small set. Targets are the vectors of both bones of both arms in camera axes
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 from tqdm.auto import tqdm
@@ -24,7 +24,16 @@ from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = ["FEW", "LIFTERS", "Lifter", "Recurrent", "fit_lifter", "multilayer", "train_lifter"]
+__all__ = [
+    "FEW",
+    "LIFTERS",
+    "Lifter",
+    "Recurrent",
+    "draw_pieces",
+    "fit_lifter",
+    "multilayer",
+    "train_lifter",
+]
 
 LIFTERS = ("nearest neighbour", "MLP", "GRU, causal")
 _BONES = 12  # numbers: two bones of two arms
@@ -147,6 +156,24 @@ def multilayer(n_inputs: int, n_outputs: int = _BONES) -> nn.Module:
     )  # fmt: skip
 
 
+def draw_pieces(
+    weights: Float[Tensor, " N"],
+    lengths: Sequence[int],
+    frames: int,
+    count: int,
+    generator: torch.Generator,
+) -> Iterator[tuple[int, Int[Tensor, " T"]]]:
+    """Yield which sequence a random piece is of, and its frames; short ones end in their last frame.
+
+    Args:
+        weights: by which sequences are drawn, of any sum. lengths: of the sequences.
+        frames: of a piece. count: number of pieces. generator: of random numbers.
+    """
+    for i in torch.multinomial(weights, count, True, generator=generator).tolist():
+        first = int(torch.randint(max(1, lengths[i] - frames), (1,), generator=generator))
+        yield i, (first + torch.arange(frames)).clamp_max(lengths[i] - 1)
+
+
 class _Examples:
     """Draws of features and bones: sequences of arms in random cameras."""
 
@@ -200,15 +227,10 @@ class _Examples:
         return torch.randn(*shape, generator=self.generator)
 
     def _drawn(self, frames: int, count: int) -> Float[Tensor, "N T 2 3 3"]:
-        """Return arms of random pieces of the recordings; short ones end in their last frame."""
-        picked = torch.multinomial(self.weight, count, True, generator=self.generator).tolist()
-        pieces = []
-        for i in picked:
-            sequence = self.pool[i]
-            most = max(1, len(sequence) - frames)
-            first = int(torch.randint(most, (1,), generator=self.generator))
-            pieces.append(sequence[(first + torch.arange(frames)).clamp_max(len(sequence) - 1)])
-        return torch.stack(pieces)
+        """Return arms of random pieces of the recordings."""
+        lengths = [len(sequence) for sequence in self.pool]
+        pieces = draw_pieces(self.weight, lengths, frames, count, self.generator)
+        return torch.stack([self.pool[i][rows] for i, rows in pieces])
 
     def _mirrored(self, arms: Float[Tensor, "N T 2 3 3"]) -> Float[Tensor, "N T 2 3 3"]:
         """Return the arms, every second time as a mirror has them."""

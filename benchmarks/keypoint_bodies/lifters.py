@@ -17,11 +17,12 @@ from jaxtyping import Float
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from benchmarks._lifters import Recurrent, multilayer, train_lifter
+from benchmarks._lifters import Recurrent, draw_pieces, multilayer, train_lifter
 from benchmarks.keypoint_bodies.clips import TRAINING, Clip, recorded, see
 from benchmarks.keypoint_bodies.scoring import Estimate
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
+from torchpose.whole_body._keypoints.lifting_network import INPUTS, lifting_features
 
 MLP, GRU, MEAN = "mlp", "gru", "mean-pose"
 _STEPS, _FRAMES = 4_000, 48
@@ -31,7 +32,6 @@ _TARGET = 0.3  # metres
 _PASSES, _CLOSE = 4, 0.1  # metres, from where on an error counts less
 _JOINTS = len(BODY_15.names)
 _PELVIS = BODY_15.joint("pelvis")
-_INPUTS = 4 * _JOINTS + 4  # of `features`
 
 
 class Examples(NamedTuple):
@@ -50,13 +50,9 @@ class Examples(NamedTuple):
         Args:
             count: pieces. generator: of random numbers.
         """
-        lengths = torch.tensor([float(len(x)) for x in self.seen])
-        picked = torch.multinomial(lengths, count, True, generator=generator).tolist()
-        starts = [int(torch.randint(max(1, len(self.seen[i]) - _FRAMES), (1,), generator=generator))
-                  for i in picked]  # fmt: skip
-        rows = [(start + torch.arange(_FRAMES)).clamp_max(len(self.seen[i]) - 1)
-                for i, start in zip(picked, starts, strict=True)]  # fmt: skip
-        pairs = list(zip(picked, rows, strict=True))
+        lengths = [len(x) for x in self.seen]
+        weights = torch.tensor(lengths, dtype=torch.float32)
+        pairs = list(draw_pieces(weights, lengths, _FRAMES, count, generator))
         return (torch.stack([self.seen[i][r] for i, r in pairs]),
                 torch.stack([self.joints[i][r] for i, r in pairs]))  # fmt: skip
 
@@ -142,8 +138,8 @@ def load_lifters(data: Path, file: Path | None, quick: bool) -> Mapping[str, Bod
     """
     torch.manual_seed(0)
     nets: dict[str, nn.Module] = {
-        MLP: multilayer(_INPUTS, 3 * _JOINTS),
-        GRU: Recurrent(_INPUTS, 3 * _JOINTS),
+        MLP: multilayer(INPUTS, 3 * _JOINTS),
+        GRU: Recurrent(INPUTS, 3 * _JOINTS),
     }
     if file is not None and file.is_file():
         kept = load_file(file)
@@ -194,13 +190,7 @@ def features(
     """
     matrix = rig.matrix[0]
     rays = (keypoints[:, 0] - matrix[:2, 2]) / matrix.diagonal()[:2]
-    middle = rays.nanmedian(1, keepdim=True).values.nan_to_num()
-    extent = (rays - middle).norm(dim=-1).nanmedian(1).values.nan_to_num(0.1).clamp_min(1e-3)
-    apart = ((rays - middle) / extent[:, None, None]).nan_to_num().clamp(-5, 5)
-    there = rays.isfinite().all(-1)
-    rate = torch.full_like(extent, fps / 60.0)[:, None]
-    parts = (apart.flatten(1), there, confidence[:, 0], middle[:, 0], extent.log()[:, None], rate)
-    return torch.cat([part.float() for part in parts], -1)
+    return lifting_features(rays, confidence[:, 0], fps)
 
 
 def _example(clip: Clip) -> tuple[Tensor, Tensor]:

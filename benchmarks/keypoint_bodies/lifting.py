@@ -18,17 +18,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks._lifters import train_lifter
+from benchmarks._lifters import draw_pieces, train_lifter
 from benchmarks.keypoint_bodies.clips import TRAINING, WALKS, Clip, recorded, see
 from torchpose.body import BODY_15
 from torchpose.math import euler_to_matrix
+from torchpose.whole_body._keypoints.keypoint_body_tracker import INLIER
 from torchpose.whole_body._keypoints.lifting_network import (
     LiftingNetwork,
     LiftingNetworkInfo,
     lifting_features,
 )
 
-__all__ = ["fit_lifting_network", "fit_shipped"]
+__all__ = ["fit_shipped"]
 
 _STEPS, _QUICK_STEPS = 8_000, 2
 _SEQUENCES, _FRAMES = 32, 48
@@ -38,7 +39,6 @@ _UNIT = 0.3  # metres in which errors count
 _TURNS = (4.0, 8.0, 6.0)  # degrees: standard deviations of roll, pitch and yaw of the camera
 _HIDDEN = (("knee", "ankle"), ("hip", "knee", "ankle"), ("elbow", "wrist"), ("wrist",))
 _SHARE_HIDDEN = 0.25
-_TRUST = (0.05, 0.97)  # as `BodyTracker` limits it
 _PELVIS = BODY_15.joint("pelvis")
 
 
@@ -64,10 +64,10 @@ def fit_shipped(data: Path, quick: bool = False) -> LiftingNetwork:
         licence="MIT; see the card for the recordings",
         command="python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors",
     )
-    return fit_lifting_network(data, patterns, info, _QUICK_STEPS if quick else _STEPS)
+    return _fitted(data, patterns, info, _QUICK_STEPS if quick else _STEPS)
 
 
-def fit_lifting_network(
+def _fitted(
     data: Path,
     patterns: Mapping[str, Sequence[str]],
     info: LiftingNetworkInfo,
@@ -118,7 +118,7 @@ def _views(clip: Clip) -> list[_Recording]:
     ):
         there = pixels.isfinite().all(-1) & (sure > 0)
         rays = ((pixels - matrix[:2, 2]) / matrix.diagonal()[:2]).nan_to_num()
-        trust = torch.where(there, sure.clamp(*_TRUST), 0.0)
+        trust = torch.where(there, sure.clamp(*INLIER), 0.0)
         joints = apart @ rotation.mT
         views.append(_Recording(rays.float(), trust.float(), joints.float(), clip.fps))
     return views
@@ -142,13 +142,11 @@ def _drawn(
     pool: Sequence[_Recording], generator: torch.Generator
 ) -> tuple[Float[Tensor, "N T F"], Float[Tensor, "N T 15 3"]]:
     """Return features and joints, metres from the pelvis, of random pieces in turned cameras."""
-    lengths = torch.tensor([float(len(x.rays)) for x in pool])
-    picked = torch.multinomial(lengths, _SEQUENCES, True, generator=generator).tolist()
+    lengths = [len(one.rays) for one in pool]
+    weights = torch.tensor(lengths, dtype=torch.float32)
     seen, joints = [], []
-    for i in picked:
+    for i, rows in draw_pieces(weights, lengths, _FRAMES, _SEQUENCES, generator):
         one = pool[i]
-        first = int(torch.randint(max(1, len(one.rays) - _FRAMES), (1,), generator=generator))
-        rows = (first + torch.arange(_FRAMES)).clamp_max(len(one.rays) - 1)
         turn = _camera_turn(generator)
         ahead = torch.cat([one.rays[rows], torch.ones_like(one.rays[rows][..., :1])], -1) @ turn.mT
         sure = one.confidence[rows] * _shown(generator) * (ahead[..., 2] > 0.1)

@@ -13,9 +13,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
-from torchpose._core.module_state import outside_inference
-from torchpose._core.reading import reading
-from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
+from torchpose._core.network_file import read_network, write_network
+from torchpose._core.tensor_file import FileKind
 from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
 from torchpose.measure._hand_layers import Layer, UpwardLayer, for_inference
 
@@ -187,8 +186,7 @@ class HandNetwork(nn.Module):
         Raises:
             OutputError: the file cannot be written.
         """
-        tensors = {k: v.detach().cpu().half() for k, v in self.state_dict().items() if v.ndim}
-        write_tensors(path, _KIND, self.info, tensors)
+        write_network(path, _KIND, self.info, self)
 
     @classmethod
     def load(cls, path: str | Path) -> HandNetwork:
@@ -197,12 +195,7 @@ class HandNetwork(nn.Module):
         Raises:
             InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
         """
-        info, tensors = read_tensors(path, _KIND)
-        with reading(path, "a network of hands"), outside_inference():
-            made = cls(info)
-            counts = {k: v for k, v in made.state_dict().items() if not v.ndim}  # of batches
-            made.load_state_dict({k: v.float() for k, v in tensors.items()} | counts)
-        return made.eval().requires_grad_(False)
+        return read_network(path, _KIND, cls, "a network of hands")
 
 
 def _with_gone(

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.module_state import outside_inference
-from torchpose._core.reading import reading
-from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
+from torchpose._core.network_file import read_network, write_network
+from torchpose._core.tensor_file import FileKind
 from torchpose.body._skeleton import BODY_15
 
 __all__ = [
+    "INPUTS",
     "Lifted",
     "LiftingNetwork",
     "LiftingNetworkInfo",
@@ -26,7 +26,8 @@ __all__ = [
 
 _SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "lifting" / "whole-body.safetensors"
 _JOINTS = len(BODY_15.names)
-_INPUTS = 4 * _JOINTS + 4  # of `lifting_features`
+INPUTS = 4 * _JOINTS + 4
+"""Number of `lifting_features`."""
 _WIDTH, _LAYERS = 128, 2
 _UNIT = 0.3  # metres of an output
 _RATE, _RATES = 60.0, (0.25, 1.0)  # frames per second of an input, and its limits
@@ -80,7 +81,7 @@ class LiftingNetwork(nn.Module):
     def __init__(self, info: LiftingNetworkInfo | None = None) -> None:
         super().__init__()
         self.info = info or LiftingNetworkInfo()
-        self.cells = nn.GRU(_INPUTS, _WIDTH, _LAYERS, batch_first=True)
+        self.cells = nn.GRU(INPUTS, _WIDTH, _LAYERS, batch_first=True)
         self.places = nn.Linear(_WIDTH, 3 * _JOINTS)
         self.spread = nn.Linear(_WIDTH, _JOINTS)
 
@@ -106,8 +107,7 @@ class LiftingNetwork(nn.Module):
         Raises:
             OutputError: the file cannot be written.
         """
-        tensors = {name: value.detach().cpu().half() for name, value in self.state_dict().items()}
-        write_tensors(path, _KIND, self.info, tensors)
+        write_network(path, _KIND, self.info, self)
 
     @classmethod
     def load(cls, path: str | Path) -> LiftingNetwork:
@@ -116,11 +116,7 @@ class LiftingNetwork(nn.Module):
         Raises:
             InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
         """
-        info, tensors = read_tensors(path, _KIND)
-        with reading(path, "a network that lifts keypoints"), outside_inference():
-            made = cls(info)
-            made.load_state_dict({name: value.float() for name, value in tensors.items()})
-        return made.eval().requires_grad_(False)
+        return read_network(path, _KIND, cls, "a network that lifts keypoints")
 
 
 def lifting_features(
