@@ -1,3 +1,4 @@
+from contextlib import ExitStack
 from dataclasses import replace
 
 import cv2
@@ -5,15 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.body import BODY_15, Body
+from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli import main
 from torchpose.cli._track_body_output import action_text
+from torchpose.io import Keypoints, write_keypoints
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors._actions.postures import state_postures
 from torchpose.priors._limb_conditionals import in_body_frame
-from torchpose.video import VideoWriter
+from torchpose.video import VideoWriter, open_video
+from torchpose.video._silhouettes import SilhouetteMeasurer, fit_views, read_silhouettes
 from torchpose.whole_body import BodyTrack, BodyTracker, render
 
 HEIGHT, WIDTH, N = 120, 160, 8
@@ -109,6 +112,49 @@ def test_poses_from_videos(recorded, tmp_path, capsys):
     again = [*given, "--overlay", "false", "--pictures", "false"]
     assert main(arguments(folder, tmp_path / "b", *again)) == 0
     assert torch.equal(BodyTrack.load(tmp_path / "b" / "body.npz").state, poses.state)
+
+
+def test_silhouettes_count_beside_keypoints(recorded, tmp_path):
+    folder, body, states = recorded
+    cameras = list(load_cameras(folder / "cameras.toml").values())
+    rig = CameraRig(cameras)
+    generator = torch.Generator().manual_seed(0)
+    points = rig(body.joints(states)).pixels
+    points = points + 0.5 * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+    longer = torch.cat([points, points[-1:]])
+    for c, name in enumerate(rig.names):
+        size = {"fps": 60.0, "image_size": (WIDTH, HEIGHT)}
+        write_keypoints(tmp_path / f"{name}.npz", Keypoints(longer[:, c], BODY_15.names, **size))
+    given = [
+        "track-body", str(folder / "cameras.toml"), *(str(tmp_path / f"{n}.npz") for n in rig.names),
+        "--videos", *(str(folder / f"{n}.mp4") for n in rig.names),
+        "--method", "sir", "--n-particles", "100", "--seed", "3", "--overlay", "false",
+        "--initial-pose", str(folder / "start.npz"), "--body", str(folder / "start.npz"),
+    ]  # fmt: skip
+    both = ["--silhouettes", "true", "--rows", "60"]
+    both += ["--background", *(str(folder / f"{n}.png") for n in rig.names)]
+    assert main([*given, "--out", str(tmp_path / "alone")]) == 0
+    assert main([*given, *both, "--out", str(tmp_path / "both")]) == 0
+    alone, poses = (BodyTrack.load(tmp_path / name / "body.npz") for name in ("alone", "both"))
+    assert (len(alone), len(poses)) == (N + 1, N)
+    assert any("keypoints have 9 frames and videos 8" in note for note in poses.notes)
+
+    views = fit_views(cameras, [(WIDTH, HEIGHT)] * 3, 60)
+    empty = [[cv2.imread(str(folder / f"{name}.png"))[..., ::-1]] for name in rig.names]
+    measurers = [SilhouetteMeasurer(*pair) for pair in zip(views, empty, strict=True)]
+    with ExitStack() as stack:
+        sources = [stack.enter_context(open_video(folder / f"{n}.mp4")) for n in rig.names]
+        masks = torch.stack(list(read_silhouettes(sources, measurers)))
+    half = (points + 0.5) / 2 - 0.5
+    tracker = BodyTracker(
+        [view.camera for view in views], "sir", n_particles=100, body=body, fps=60.0, pixel_std=0.5
+    )
+    expected = tracker(
+        masks, fit_state(tracker.body, body.joints(states[:1]))[0], keypoints=half,
+        generator=torch.Generator().manual_seed(3),
+    )  # fmt: skip
+    torch.testing.assert_close(poses.joints3d, expected.joints3d)
+    assert float((poses.joints3d - body.joints(states)).norm(dim=-1).mean()) < 0.08
 
 
 def test_nobody_there_is_said(recorded, tmp_path, capsys):

@@ -296,6 +296,12 @@ def test_an_unknown_rate_is_said(track, tmp_path):
     [
         (("front_json", "left.csv"), "a camera for each of the 2 inputs"),
         ((*MIXED, "--background", "a.png", "b.png", "c.png"), "--background is for silhouettes"),
+        (
+            (*MIXED, "--silhouettes", "true"),
+            "--silhouettes true needs a particle filter by --method",
+        ),
+        ((*MIXED, "--silhouettes", "true", "--method", "sir"), "needs the videos of all cameras"),
+        (("front.mp4", "left.mp4", "behind.mp4", "--silhouettes", "true"), "is for keypoints"),
         ((*MIXED, "--manifold", "walk"), "--manifold is for particle filters, and keypoints are"),
         (
             (*MIXED, "--n-particles", 300),

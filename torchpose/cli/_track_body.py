@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from torchpose._core.checks import check_choice, check_positive
 from torchpose._core.terminal import show_progress
+from torchpose.cli._body_recordings import Recordings, SilhouetteSettings
 from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible, share_cores
 from torchpose.cli._options import Option, options_of, options_of_methods
+from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import (
     KALMAN,
     BodyJob,
-    Recordings,
+    action_text,
     body_results,
     draw,
-    facts_of,
     gate_is_in_a_note,
     summary,
     write_page,
@@ -39,6 +40,7 @@ torchpose track-body cameras.toml cam1_json/ cam2_json/ --refine both --out resu
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --persons all --out result
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --method mrpf --manifold walk --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 --detector rtmpose-m.onnx --out result
+torchpose track-body cameras.toml cam*.npz --videos cam*.mp4 --silhouettes true --method apf --out result
 torchpose track-body cameras.toml cam*.npz --formats trc c3d bvh --up z --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
 torchpose track-body cameras.toml cam*.mp4 --background empty*.png --height 1.82 --out result
@@ -54,10 +56,12 @@ PYTHON_ONLY = frozenset({
     "velocity_rate", "max_redraws", "gate_width",
 })  # fmt: skip
 """Options of the shipped filters that only Python has: what the papers' experiments vary."""
-_OF_SILHOUETTES = ("background", "ignore_still", "facing", "rows", "sharpness")
+_HOW_SILHOUETTES = ("background", "ignore_still", "rows", "sharpness")
 _OF_PARTICLES = ("initial_pose", "manifold", "conditionals", "action", "n_particles")
 _OF_KALMAN = ("smoothing", "refine", "persons", "motion", "lifting")
-_OF_KEYPOINTS = (*_OF_KALMAN, "videos", "keypoint_std", "pixel_std", "min_confidence")
+_OF_KEYPOINTS = (
+    *_OF_KALMAN, "videos", "silhouettes", "keypoint_std", "pixel_std", "min_confidence"
+)  # fmt: skip
 
 
 def main(arguments: list[str]) -> int:
@@ -117,6 +121,7 @@ def run(
     refine: Literal["none", "delays", "extrinsics", "both"] = "none",
     persons: str | int | None = None,
     videos: list[str] | None = None,
+    silhouettes: bool = False,
     background: list[str] | None = None,
     ignore_still: bool = False,
     method: str | None = None,
@@ -156,6 +161,7 @@ def run(
         persons: kalman: track several persons, all or at most N at a time; without it one is followed.
         videos: keypoints: a video per camera, into which the body is drawn; by default the inputs, if they
             are videos.
+        silhouettes: keypoints and --method: let silhouettes of these videos count beside the keypoints.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
             what stays in a video is its background, so the person has to move about.
         ignore_still: with --background: take what always looks the same in a video for an object that was
@@ -225,7 +231,7 @@ def run(
             shown = []
             if overlay or job.pictures:
                 shown = draw(recordings, [poses], results.stage, overlay, job.pictures)
-        facts = facts_of(given, body_tracker, recordings, poses, seconds)
+        facts = _facts(given, body_tracker, recordings, poses, seconds)
         shown += write_page(recordings.views[0].source, [poses], facts, results.stage)
         written += results.commit(shown)
     return summary([poses], facts, written, results.notes)
@@ -265,10 +271,13 @@ def _run_on_keypoints(
     if not _of_particles(values["method"]):
         names = ("body", "height", "keypoint_std", "pixel_std", "motion", "lifting")
         arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
+    outlines = None
+    if values["silhouettes"]:
+        outlines = SilhouetteSettings(values["rows"], values["background"], values["ignore_still"])
     settings = KeypointSettings(
         detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments,
         values["refine"], values["persons"], values["method"] or KALMAN,
-        values["initial_pose"], values["seed"],
+        values["initial_pose"], values["seed"], outlines,
     )  # fmt: skip
     return track_keypoints(job, inputs, cameras, settings)
 
@@ -276,6 +285,31 @@ def _run_on_keypoints(
 def _of_particles(method: str | None) -> bool:
     """Return whether keypoints are tracked by a particle filter."""
     return method not in (None, KALMAN)
+
+
+def _facts(
+    given: Given,
+    tracker: "BodyTracker",
+    recordings: Recordings,
+    poses: "BodyTrack",
+    seconds: float,
+) -> dict[str, str]:
+    """Return what was tracked, and how, by the name of each fact."""
+    height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
+    values = given.values
+    matters = "sharpness" not in tracker.filter.unused
+    sharpness = f", sharpness {tracker.filter.sharpness:g}" if matters else ""
+    facts = {
+        "videos": f"{len(recordings.videos)} cameras, {recordings.fps:g} fps",
+        "silhouettes": f"{width} x {height} pixels, "
+        + ("against the empty scene" if recordings.background else "against what stays"),
+        "method": f"{tracker.method}, {tracker.n_particles} particles{sharpness}",
+        "learnt": ", ".join(filter(None, map(values.get, ("manifold", "conditionals", "action")))),
+        "body": values["body"] or f"average proportions, {tracker.upright.height:.3g} m",
+        "actions": action_text(poses),
+        "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
+    }
+    return {name: fact for name, fact in facts.items() if fact}
 
 
 def _refuse_others(given: Given, by_keypoints: bool) -> None:
@@ -306,9 +340,16 @@ def _refuse_others(given: Given, by_keypoints: bool) -> None:
 def _refuse_beside_keypoints(given: Given, method: str | None) -> None:
     """Raise `InputError` for options of silhouettes, or of another method than keypoints are tracked by."""
     _refuse(
-        given, _OF_SILHOUETTES,
-        "silhouettes of videos, which are not computed where keypoints are given",
+        given, ("facing",),
+        "silhouettes of videos, and where keypoints are given the first pose is found in these",
     )  # fmt: skip
+    if given.values["silhouettes"]:
+        _check_silhouettes(given.values, method)
+    else:
+        _refuse(
+            given, _HOW_SILHOUETTES,
+            "silhouettes of videos, which are not computed beside keypoints without --silhouettes true",
+        )  # fmt: skip
     if _of_particles(method):
         _refuse(given, _OF_KALMAN, f"{KALMAN}, and --method {method} is given")
     else:
@@ -318,6 +359,18 @@ def _refuse_beside_keypoints(given: Given, method: str | None) -> None:
     if given.values["detector"] is None and given.values["min_confidence"] is not None:
         raise InputError(
             "--min-confidence is for --detector; confidences of files count as they are"
+        )
+
+
+def _check_silhouettes(values: dict[str, Any], method: str | None) -> None:
+    """Raise `InputError` if silhouettes cannot count beside keypoints."""
+    if not _of_particles(method):
+        raise InputError(
+            f"--silhouettes true needs a particle filter by --method; {KALMAN} takes keypoints alone"
+        )
+    if values["videos"] is None and not all(map(is_video, values["inputs"])):
+        raise InputError(
+            "--silhouettes true needs the videos of all cameras, by --videos, or as inputs of --detector"
         )
 
 

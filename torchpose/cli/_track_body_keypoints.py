@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchpose._core.terminal import show_progress
@@ -13,6 +14,12 @@ from torchpose.cli._body_keypoint_inputs import (
     BodyKeypoints,
     DetectorSettings,
     read_body_keypoints,
+)
+from torchpose.cli._body_recordings import (
+    Recordings,
+    SilhouetteSettings,
+    in_silhouettes,
+    pixel_scale,
 )
 from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import (
@@ -57,6 +64,7 @@ class KeypointSettings(NamedTuple):
         tracker: the arguments of `BodyTracker`. refine: what of the cameras is estimated.
         persons: "all", or how many there are at most at a time; None for the one who is followed.
         method: of tracking. initial_pose, seed: of particle filters, as of the command.
+        silhouettes: how the videos become some, which count beside the keypoints; None for none.
     """
 
     detector: DetectorSettings | None
@@ -70,6 +78,7 @@ class KeypointSettings(NamedTuple):
     method: str = KALMAN
     initial_pose: str | None = None
     seed: int = 0
+    silhouettes: SilhouetteSettings | None = None
 
 
 def track_keypoints(
@@ -92,18 +101,22 @@ def track_keypoints(
     overlay = job.overlay and shown is not None
     with ExitStack() as stack:
         films = None
-        if shown is not None and (overlay or job.pictures):
+        outlined = settings.silhouettes is not None
+        if shown is not None and (overlay or job.pictures or outlined):
             films = stack.enter_context(Films(shown, cameras, settings.delays))
         results = stack.enter_context(
-            body_results(job, cameras, overlay, _more(job, films is not None, settings))
+            body_results(job, cameras, overlay, _more(job, shown is not None, settings))
         )
         keypoints = read_body_keypoints(
             inputs, cameras, detector=settings.detector, fps=settings.fps, delays=settings.delays,
             other_rates=[] if films is None else films.rates,
             everybody=settings.persons is not None,
         )  # fmt: skip
+        recordings = None
+        if films is not None and settings.silhouettes is not None:
+            recordings = stack.enter_context(films.recordings(keypoints.fps, settings.silhouettes))
         start = time.perf_counter()
-        people = _track(keypoints, settings)
+        people = _track(keypoints, settings, recordings)
         seconds = time.perf_counter() - start
         if not people:
             print(f"torchpose: {_nobody(keypoints)}, so there are no poses", file=sys.stderr)
@@ -111,7 +124,7 @@ def track_keypoints(
         stage, drawn = results.stage, []
         keypoints, cameras_file = _refined(keypoints, settings, people[0], stage)
         written = results.commit([*write_people(job, stage, people), *cameras_file])
-        if films is not None:
+        if films is not None and (overlay or job.pictures):
             drawn = draw(films.showing(keypoints), people, stage, overlay, job.pictures)
         if job.pictures:
             drawn += _write_skeletons(stage, people, cameras[0])
@@ -158,8 +171,13 @@ def _tracker(
     return BodyTracker(cameras, settings.method, fps=fps, **settings.tracker)
 
 
-def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "list[BodyTrack]":
-    """Return the poses of everybody."""
+def _track(
+    keypoints: BodyKeypoints, settings: KeypointSettings, recordings: Recordings | None = None
+) -> "list[BodyTrack]":
+    """Return the poses of everybody, by keypoints and the silhouettes of recordings, if there are some."""
+    if recordings is not None:
+        settings = _in_pixels_of(settings, pixel_scale(keypoints, recordings))
+        keypoints = in_silhouettes(keypoints, recordings)
     tracker = _tracker(keypoints.cameras, keypoints.fps, settings)
     options: dict[str, Any] = {
         "persons": settings.persons, "smoothing": settings.smoothing, "refine": settings.refine,
@@ -171,6 +189,8 @@ def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "list[BodyTr
             "initial_state": first_state(tracker, settings.initial_pose),
             "generator": torch.Generator().manual_seed(settings.seed),
         }
+    if recordings is not None:
+        options["silhouettes"] = islice(recordings.silhouettes(), len(keypoints.points))
     with gate_is_in_a_note():
         try:
             found = tracker(
@@ -180,7 +200,17 @@ def _track(keypoints: BodyKeypoints, settings: KeypointSettings) -> "list[BodyTr
         except NobodySeenError:
             return []
     people = [found] if settings.persons is None else found
-    return [replace(poses, notes=(*keypoints.notes, *poses.notes)) for poses in people]
+    notes = (*keypoints.notes, *(() if recordings is None else recordings.notes))
+    return [replace(poses, notes=(*notes, *poses.notes)) for poses in people]
+
+
+def _in_pixels_of(settings: KeypointSettings, scale: float) -> KeypointSettings:
+    """Return settings for images of another size, whose pixels are 1 / scale of those of the keypoints."""
+    from torchpose.whole_body._keypoints.keypoint_body_tracker import PIXEL_STD
+
+    std = settings.tracker["pixel_std"]
+    own = {"pixel_std": scale * (PIXEL_STD if std is None else std)}
+    return settings._replace(tracker={**settings.tracker, **own})
 
 
 def first_state(tracker: "BodyTracker", file: str | None) -> "Tensor | None":
@@ -202,6 +232,7 @@ def _facts(
 ) -> dict[str, str]:
     """Return what was tracked, and how, by the name of each fact."""
     source = "files" if settings.detector is None else settings.detector.where
+    source += ", with silhouettes" if settings.silhouettes is not None else ""
     n_cameras = len(keypoints.cameras)
     everybody = settings.persons is not None
     agreement = {}
@@ -321,6 +352,13 @@ class Films:
     def __exit__(self, *_: object) -> None:
         for source in self._sources:
             source.close()
+
+    def recordings(self, fps: float, settings: SilhouetteSettings) -> Recordings:
+        """Return the same videos at a frame rate, to become silhouettes."""
+        return Recordings(
+            self._videos, self._cameras, settings.rows, fps=fps, delays=self._delays,
+            background=settings.background, ignore_still=settings.ignore_still,
+        )  # fmt: skip
 
     def showing(self, keypoints: BodyKeypoints) -> "Films":
         """Return the same with keypoints to be drawn, at whose frame rate the videos are read."""

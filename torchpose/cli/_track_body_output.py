@@ -1,10 +1,9 @@
-"""What `torchpose track-body` reads, writes and prints: videos as silhouettes, poses, pictures, words."""
+"""What `torchpose track-body` writes and prints: poses, pictures, words."""
 
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -15,22 +14,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.camera._rig import CameraRig
-    from torchpose.cli._command import Given
     from torchpose.io._results import ResultsFolder
-    from torchpose.video._silhouettes import SilhouetteMeasurer, SilhouetteView
-    from torchpose.video._source_interface import VideoSource
     from torchpose.whole_body._body_track import BodyTrack
-    from torchpose.whole_body._body_tracker import BodyTracker
 
 __all__ = [
     "KALMAN",
     "BodyJob",
-    "Recordings",
     "action_text",
     "body_results",
     "draw",
-    "facts_of",
     "gate_is_in_a_note",
     "project_joints",
     "summary",
@@ -92,161 +84,6 @@ class DrawnVideos(Protocol):
     def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
         """Return the images of frame t of all cameras with the bodies that are there."""
         ...
-
-
-class Recordings:
-    """The videos, how each becomes silhouettes, and the silhouettes that were seen so far.
-
-    A context manager, which closes the videos.
-
-    Args:
-        videos: a file or a folder of images for each camera. cameras: in the same order.
-        rows: height of the silhouettes. fps: rate at which all are read, by default their own.
-        delays: frames by which each began too early. background: of the empty scene for each camera.
-        ignore_still: whether what always looks the same in a video is no person.
-    """
-
-    def __init__(
-        self,
-        videos: Sequence[str],
-        cameras: "Sequence[PinholeCamera]",
-        rows: int,
-        *,
-        fps: float | None = None,
-        delays: Sequence[int] | None = None,
-        background: Sequence[str] | None = None,
-        ignore_still: bool = False,
-    ) -> None:
-        from torchpose.video._silhouettes import fit_views
-
-        self.videos, self._fps, self.background = videos, fps, background or ()
-        self._delays, self._ignore_still = delays, ignore_still
-        self.sources = self._open()
-        self.views = fit_views(cameras, [s.size for s in self.sources], rows)
-        self.packed: list[Any] = []
-        self.notes: list[str] = []
-
-    def __enter__(self) -> "Recordings":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for source in self.sources:
-            source.close()
-
-    @cached_property
-    def rig(self) -> "CameraRig":
-        """Return the cameras of the silhouettes."""
-        from torchpose.camera._rig import CameraRig
-
-        return CameraRig([view.camera for view in self.views])
-
-    @property
-    def fps(self) -> float:
-        """Return the frames per second."""
-        return float(self.sources[0].fps)
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Return the names of the cameras."""
-        return self.rig.names
-
-    @property
-    def sizes(self) -> list[tuple[int, int]]:
-        """Return (width, height) of each video."""
-        return [view.size for view in self.views]
-
-    @property
-    def n_frames(self) -> int | None:
-        """Return how many frames to expect, None if unknown."""
-        counts = [s.n_frames for s in self.sources if s.n_frames is not None]
-        return min(counts, default=None)
-
-    def silhouettes(self) -> "Iterator[Tensor]":
-        """Learn the background; return silhouettes [C, H, W] of one frame after the other.
-
-        They are kept, a bit per pixel.
-        """
-        return self._read(self._measurers())
-
-    def _read(self, measurers: "list[SilhouetteMeasurer]") -> "Iterator[Tensor]":
-        import numpy as np
-
-        from torchpose.video._silhouettes import read_silhouettes
-
-        for masks in read_silhouettes(self.sources, measurers, self._delays):
-            self.packed.append(np.packbits(masks.numpy(), axis=-1))
-            yield masks
-
-    def kept(self, frame: int) -> "Tensor":
-        """Return the silhouettes of a frame that was read."""
-        import numpy as np
-        import torch
-
-        width = self.rig.sizes[0][1]  # type: ignore[index]  # views have sizes
-        bits = np.unpackbits(self.packed[frame], axis=-1)[..., :width]
-        return torch.from_numpy(bits.astype(bool))
-
-    def images(self) -> Iterator[tuple[Any, ...]]:
-        """Read the frames of all cameras once more."""
-        from torchpose.video._silhouettes import frames_in_step
-
-        sources = self._open()
-        try:
-            for frames in frames_in_step(sources, self._delays or [0] * len(sources)):
-                yield tuple(frame.image for frame in frames)
-        finally:
-            for source in sources:
-                source.close()
-
-    def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the one body and the outline."""
-        from torchpose.video._overlay import draw_body
-        from torchpose.whole_body._silhouettes.rendering import render
-
-        (poses,) = people
-        k, rig = t - poses.first_frame, self.rig
-        height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
-        model = render(poses.body, poses.state[k], rig, height, width)
-        measured = self.kept(t)
-        drawn = []
-        for c, (view, image) in enumerate(zip(self.views, images, strict=True)):
-            part = _inside(view)
-            joints = project_joints(poses.joints3d[k], view.source)
-            drawn.append(
-                draw_body(image, joints, poses.body.skeleton,
-                          model=model[c][part], silhouette=measured[c][part])
-            )  # fmt: skip
-        return drawn
-
-    def _open(self) -> "list[VideoSource]":
-        from torchpose.video._source import open_video
-
-        return [open_video(path, fps=self._fps) for path in self.videos]
-
-    def _measurers(self) -> "list[SilhouetteMeasurer]":
-        from torchpose.video._silhouettes import (
-            SilhouetteMeasurer,
-            learning_frames,
-            read_empty_scene,
-        )
-        from torchpose.video._source import open_video
-
-        print("learning the background ...", flush=True)
-        empty = [read_empty_scene(path) for path in self.background]
-        if not empty:
-            self.notes.append(
-                "without --background what stays in the videos is taken for their background; a part "
-                "of the person that never moves is taken for it, too"
-            )
-        measurers = []
-        for i, (view, path) in enumerate(zip(self.views, self.videos, strict=True)):
-            if empty and not self._ignore_still:
-                measurers.append(SilhouetteMeasurer(view, empty[i]))
-                continue
-            with open_video(path, fps=self._fps) as source:
-                frames = learning_frames(source)
-                measurers.append(SilhouetteMeasurer(view, empty[i] if empty else None, frames))
-        return measurers
 
 
 def body_results(
@@ -351,12 +188,6 @@ def draw(
     return files
 
 
-def _inside(view: "SilhouetteView") -> tuple[slice, slice]:
-    """Return the part of a silhouette that the frame of the video shows."""
-    (w, h), (right, below), (inner_w, inner_h) = view.size, view.padding, view.inner
-    return slice(0, round(inner_h * h / (h + below))), slice(0, round(inner_w * w / (w + right)))
-
-
 def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
     """Return the pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied."""
     import cv2
@@ -393,31 +224,6 @@ def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
         coded = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))[1]
         temporary.write_bytes(coded.tobytes())
     return path
-
-
-def facts_of(
-    given: "Given",
-    tracker: "BodyTracker",
-    recordings: "Recordings",
-    poses: "BodyTrack",
-    seconds: float,
-) -> dict[str, str]:
-    """Return what was tracked, and how, by the name of each fact."""
-    height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
-    values = given.values
-    matters = "sharpness" not in tracker.filter.unused
-    sharpness = f", sharpness {tracker.filter.sharpness:g}" if matters else ""
-    facts = {
-        "videos": f"{len(recordings.videos)} cameras, {recordings.fps:g} fps",
-        "silhouettes": f"{width} x {height} pixels, "
-        + ("against the empty scene" if recordings.background else "against what stays"),
-        "method": f"{tracker.method}, {tracker.n_particles} particles{sharpness}",
-        "learnt": ", ".join(filter(None, map(values.get, ("manifold", "conditionals", "action")))),
-        "body": values["body"] or f"average proportions, {tracker.upright.height:.3g} m",
-        "actions": action_text(poses),
-        "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
-    }
-    return {name: fact for name, fact in facts.items() if fact}
 
 
 @contextmanager

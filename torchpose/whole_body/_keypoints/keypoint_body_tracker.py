@@ -38,17 +38,18 @@ from torchpose.whole_body._keypoints.lifted_pose import PoseLifter
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import known_up
 
-__all__ = ["INLIER", "KEYPOINT_METHOD", "KeypointBodyTracker"]
+__all__ = ["INLIER", "KEYPOINT_METHOD", "PIXEL_STD", "KeypointBodyTracker"]
 
 KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
 INLIER = (0.05, 0.97)
 """Least and largest prior probability that a keypoint is its joint's."""
+PIXEL_STD = 1.0
+"""Pixels, how far keypoints are from projected joints, beside what they are off in space."""
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
 _LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
-_PIXEL_STD = 1.0  # pixels
 _FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
 
 
@@ -86,7 +87,7 @@ class KeypointBodyTracker(nn.Module):
         if keypoint_std is None:
             keypoint_std = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
         self.keypoint_std = check_positive("keypoint_std", keypoint_std)
-        self.pixel_std = check_positive("pixel_std", _PIXEL_STD if pixel_std is None else pixel_std)
+        self.pixel_std = check_positive("pixel_std", PIXEL_STD if pixel_std is None else pixel_std)
         far = rig.translation.norm(dim=-1)
         if bool((far > _FARTHEST).any()):
             raise CameraError(
