@@ -1,10 +1,12 @@
-"""Generate movements for rendered benchmarks: signing, clapping, merging hands, crossing persons.
+"""Generate movements for rendered benchmarks: hands that sign, clap, merge, cross, rise; crossing persons.
 
-Key frames are places of the hands in the torso's axes, metres; the arms follow by inverse kinematics.
+Key frames are places of the hands in the torso's axes, metres; the arms follow by inverse kinematics. Those
+of raised arms are angles, since the elbows of arms above the head are not told by the hands.
 Movements are random, so that every seed gives another sequence.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +19,18 @@ from torchpose.errors import InputError
 
 __all__ = ["PERFORMANCES", "crossing", "performance"]
 
-PERFORMANCES = ("performer", "signing", "clapping", "merging hands")
+PERFORMANCES = (
+    "performer", "signing", "clapping", "merging hands", "crossed arms", "raised arms"
+)  # fmt: skip
 """Names that `performance` takes."""
 
 Place = tuple[float, float, float]
+_Arm = tuple[float, float, float, float]
 _FASTEST = 3.2  # metres per second at the middle of a movement
 _REST: Place = (0.20, 0.66, -0.10)
 _LABEL_REST = "rest"
+_HANGING = (7.0, 4.0, -20.0, 17.0)  # abduction, flexion, twist and elbow of an arm, degrees
+_HEIGHTS = {"above": (110, 160), "beside": (60, 110), "across": (40, 100)}  # of raised arms
 
 
 class _Keys(NamedTuple):
@@ -85,13 +92,21 @@ def performance(
         raise InputError(f"need n_frames >= 1 and fps > 0, got {n_frames} and {fps}")
     if name == "performer":
         return performer(n_frames, fps, seed, size, distance)
-    make = {"signing": _sign, "clapping": _clap, "merging hands": _merge}[name]
+    clock = torch.arange(n_frames, dtype=torch.float64) / fps
     rng = np.random.default_rng([seed, PERFORMANCES.index(name)])
+    if name == "raised arms":
+        angles, labels = _raised(clock, rng, seed)
+        return stage(angles, labels, fps, size, distance)
+    make = {
+        "signing": _sign,
+        "clapping": _clap,
+        "merging hands": _merge,
+        "crossed arms": _cross,
+    }[name]
     keys = _Keys.begin()
     keys.stay(0.6)
     while keys.times[-1] < n_frames / fps:
         make(keys, rng)
-    clock = torch.arange(n_frames, dtype=torch.float64) / fps
     angles, labels = _animate(keys, clock, seed, size)
     return stage(angles, labels, fps, size, distance)
 
@@ -139,13 +154,58 @@ def _animate(
     times = torch.tensor(keys.times, dtype=torch.float64)
     hands = minimum_jerk(clock, times, torch.tensor(keys.hands, dtype=torch.float64))
     hands = hands + sway(clock, (2, 3), 0.004, (0.15, 0.8), generator)
+    angles = _swaying(clock, hands_to_arms(hands, size), generator)
+    return angles, _words(clock, times, keys.labels)
+
+
+def _swaying(clock: Tensor, arms: Tensor, generator: torch.Generator) -> BodyAngles:
+    """Return the angles of a body that sways, whose arms [T, 2, 4] are clamped to their limits."""
     low, high = torch.deg2rad(torch.tensor(list(ANGLE_LIMITS.values())).double()).unbind(-1)
-    arms = hands_to_arms(hands, size).clamp(low, high)
     torso = sway(clock, (3,), 1.6, (0.06, 0.3), generator)
     head = sway(clock, (3,), 3.0, (0.08, 0.4), generator)
-    angles = BodyAngles(hip_sway(clock, generator), torch.deg2rad(torso), torch.deg2rad(head), arms)
+    position = hip_sway(clock, generator)
+    return BodyAngles(position, torch.deg2rad(torso), torch.deg2rad(head), arms.clamp(low, high))
+
+
+def _words(clock: Tensor, times: Tensor, labels: Sequence[str]) -> tuple[str, ...]:
+    """Return the word of the key frame that comes next, for each frame."""
     after = torch.searchsorted(times, clock, right=True).clamp(1, len(times) - 1)
-    return angles, tuple(keys.labels[i] for i in after.tolist())
+    return tuple(labels[i] for i in after.tolist())
+
+
+def _raised(
+    clock: Tensor, rng: np.random.Generator, seed: int
+) -> tuple[BodyAngles, tuple[str, ...]]:
+    """Return arms, one or both, that are raised to any height and side, with the word of each frame."""
+    generator = torch.Generator().manual_seed(seed)
+    times, labels, poses = [0.0, 0.5], [_LABEL_REST] * 2, [(_HANGING, _HANGING)] * 2
+    while times[-1] < clock[-1]:
+        kind = str(rng.choice(list(_HEIGHTS), p=[0.4, 0.4, 0.2]))
+        left = _raised_arm(kind, rng)
+        right = left if rng.random() < 0.6 else _raised_arm(kind, rng)
+        which = rng.choice(["both", "left", "right"], p=[0.5, 0.25, 0.25])
+        pose = (
+            left if which != "right" else _HANGING, right if which != "left" else _HANGING
+        )  # fmt: skip
+        steps = [(kind, pose, rng.uniform(0.9, 1.4)), (kind, pose, rng.uniform(0.2, 1.2))]
+        if rng.random() < 0.4:
+            steps.append((_LABEL_REST, (_HANGING, _HANGING), rng.uniform(0.9, 1.4)))
+        for label, arms, seconds in steps:
+            times.append(times[-1] + seconds)
+            labels.append(label)
+            poses.append(arms)
+    keys = torch.tensor(times, dtype=torch.float64)
+    angles = minimum_jerk(clock, keys, torch.tensor(poses, dtype=torch.float64))
+    angles = angles + sway(clock, (2, 4), 1.3, (0.15, 0.7), generator)
+    return _swaying(clock, torch.deg2rad(angles), generator), _words(clock, keys, labels)
+
+
+def _raised_arm(kind: str, rng: np.random.Generator) -> _Arm:
+    """Return the angles of an arm that is raised, degrees."""
+    height = rng.uniform(*_HEIGHTS[kind])
+    ahead = math.radians(rng.uniform(60, 130) if kind == "across" else rng.uniform(0, 90))
+    bent = rng.uniform(8, 100 if kind == "beside" else 50)
+    return height * math.cos(ahead), height * math.sin(ahead), rng.uniform(-30, 60), bent
 
 
 # --- kinds of movement ----------------------------------------------------------------------------
@@ -197,6 +257,36 @@ def _merge(keys: _Keys, rng: np.random.Generator) -> None:
         keys.go("apart", *apart, pace)
     if rng.random() < 0.4:
         keys.rest(rng.uniform(0.2, 0.6))
+
+
+def _cross(keys: _Keys, rng: np.random.Generator) -> None:
+    """Add arms that are folded, clasped, or reach across, or a hand at the face above the other one."""
+    u = rng.uniform
+    kind = str(rng.choice(["folded", "at the face", "across", "clasped", "apart"]))
+    if kind == "folded":
+        front = 0.06 * rng.choice([-1, 1])
+        hands = (
+            (-u(0.08, 0.2), u(0.12, 0.36), front - 0.26),
+            (u(0.08, 0.2), u(0.12, 0.36), -front - 0.26),
+        )
+    elif kind == "at the face":
+        hands = (u(-0.05, 0.08), -u(0.06, 0.2), -0.25), (u(0.0, 0.14), u(0.3, 0.5), -0.24)
+    elif kind == "across":
+        hands = (-u(0.1, 0.2), u(0.1, 0.36), -0.34), (-u(0.15, 0.25), u(0.45, 0.58), -0.16)
+    elif kind == "clasped":
+        x, y, z = u(-0.05, 0.05), u(0.3, 0.56), u(-0.3, -0.2)
+        hands = (x + 0.035, y, z), (x - 0.035, y + u(-0.03, 0.03), z)
+    else:
+        hands = tuple((side * u(0.25, 0.45), u(0.0, 0.4), -u(0.14, 0.4)) for side in (1, -1))
+    left, right = hands
+    if rng.random() < 0.5:
+        left, right = _mirror(right), _mirror(left)
+    wide = u(0.2, 0.3), u(0.15, 0.4), -0.34  # between two of these, so that arms do not meet
+    keys.go("apart", wide, _mirror(wide), u(0.4, 0.7))
+    keys.go(kind, left, right, u(0.5, 1.0))
+    keys.stay(u(0.2, 1.6))
+    if rng.random() < 0.3:
+        keys.rest(u(0.2, 0.6))
 
 
 _AT_FACE = ((0.05, -0.05, -0.24), (0.10, -0.13, -0.22), (0.10, -0.21, -0.22), (0.03, -0.06, -0.25))

@@ -5,8 +5,8 @@
 
 The labels are MediaPipe's, as good as these are: a hand is seven tenths of the way from wrist to index
 finger, is seen where its visibility is above 0.6 and it is in the image, and is not to be seen where that is
-below 0.15 or the hand is below the image. Four fits leave three persons out each; six rendered performers,
-whose truth is exact, are in every fit. The second line fits the network that comes with torchpose, to
+below 0.15 or the hand is below the image. Four fits leave three persons out each. Rendered performers, whose
+truth is exact, are in every fit. The second line fits the network that comes with torchpose, to
 everybody. FOLDER keeps rendered videos and fits: started again, the command goes on where it stopped.
 
 Columns: visible hands, or elbows, that are measured within a quarter of the shoulder width; those that are

@@ -48,11 +48,16 @@ _RENDERED = (
     ("performer", "dark sleeves"), ("signing", "short sleeves"), ("clapping", "skin-coloured jumper"),
     ("merging hands", "short sleeves"), ("signing", "skin-coloured jumper"),
     ("performer", "short sleeves"),
+    *2 * (("crossed arms", "skin-coloured jumper"), ("crossed arms", "dark sleeves"),
+          ("crossed arms", "short sleeves")),
+    ("raised arms", "dark sleeves"), ("raised arms", "short sleeves"),
+    ("raised arms", "skin-coloured jumper"),
 )  # fmt: skip
 LABELLED = ("hand_left", "hand_right", "elbow_left", "elbow_right")
 """Joints that have labels, in this order."""
 _FIRST_SEED = 101  # no benchmark of video renders these seeds
 _RENDERED_FRAMES, _DISTANCE = 160, 1.6
+_LONGER, _LONGER_FRAMES = ("crossed arms", "raised arms"), 240
 SEEN, UNSEEN = (
     0.6,
     0.15,
@@ -89,7 +94,7 @@ class Windows(NamedTuple):
     """Inputs of the network from T frames, and what it has to say.
 
     Attributes:
-        lab: bytes [T, 3, 160, 192]. maps: skin, both kinds of motion, image [T, 4, 80, 96].
+        lab: bytes [T, 3, 176, 192]. maps: skin, both kinds of motion, image [T, 4, 88, 96].
         faces: (x, y, size), B from the anchors [T, 3]. places: of the joints, cells [T, 4, 2].
         seen: as in `Labels` [T, 4].
     """
@@ -157,13 +162,14 @@ def _seen(centres: Tensor, sure: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def render_clips(folder: Path) -> list[Clip]:
-    """Return six rendered performers with their truth; those that are in the folder are not made again."""
+    """Return rendered performers with their truth; those that are in the folder are not made again."""
     clips = []
     for seed, (name, look) in enumerate(_RENDERED, _FIRST_SEED):
         path = folder / f"{name.replace(' ', '-')}-{seed}.mp4"
         truth = path.with_suffix(".npz")
         if not truth.is_file():
-            moves = performance(name, _RENDERED_FRAMES, 30.0, seed, _DISTANCE)
+            n_frames = _LONGER_FRAMES if name in _LONGER else _RENDERED_FRAMES
+            moves = performance(name, n_frames, 30.0, seed, _DISTANCE)
             render_video(path, moves, demo_camera(), seed=seed, look=look, truth=truth)
         with np.load(truth) as file:
             joints = torch.from_numpy(file["joints2d"]).double()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from tqdm.auto import tqdm
 
@@ -14,12 +14,11 @@ from benchmarks.hand_network.changes import bare_skin, bordered, exchanged, lit,
 from benchmarks.hand_network.clips import Windows
 from torchpose.measure._hand_network import COARSE, HandNetwork, HandNetworkInfo, relative_colours
 
-STEPS, BATCH, _RATE, _DECAY = 900, 16, 3e-3, 1e-2
+STEPS, BATCH, _RATE, _DECAY = 1500, 16, 3e-3, 1e-2
 _BLUR = 0.9  # coarse cells: of a label
-_HANDS, _ELBOWS = slice(0, 2), slice(2, 4)  # of the labelled joints
-_SHARE_OF_ELBOWS = 2 / 3  # of the steps of the hands
+_PARTS = (slice(0, 2), 1.0), (slice(2, 4), 0.7)  # hands and elbows, and how much they count
 
-__all__ = ["STEPS", "fit", "fit_elbows"]
+__all__ = ["STEPS", "fit"]
 
 
 def fit(
@@ -31,7 +30,7 @@ def fit(
 ) -> HandNetwork:
     """Return a network fitted to windows of persons, each person equally often.
 
-    The hands come first. The elbows are then found by the features that were learnt for the hands.
+    Hands and elbows are fitted together, so that the features serve both.
 
     Args:
         clips: person and windows of each. info: facts about the fit. steps: of AdamW, 16 windows each.
@@ -39,66 +38,25 @@ def fit(
     """
     torch.manual_seed(seed)
     network = HandNetwork(info).to(memory_format=torch.channels_last)
-    of_elbows = {*network.elbows.parameters(), network.elbows_gone}
-    of_hands = [p for p in network.parameters() if p not in of_elbows]
-
-    def hands(batch: Windows) -> Tensor:
-        features = network.features(batch.lab, avg_pool2d(batch.maps, 2), batch.faces)
-        return network.logits_of_hands(features)
-
-    _descend(hands, _HANDS, of_hands, clips, steps, progress)
-    return fit_elbows(network, clips, round(_SHARE_OF_ELBOWS * steps), progress)
-
-
-def fit_elbows(
-    network: HandNetwork, clips: Sequence[tuple[str, Windows]], steps: int, progress: bool = True
-) -> HandNetwork:
-    """Fit the layers of the elbows, and leave those of the hands as they are.
-
-    Args:
-        network: a network that was fitted to hands. clips, steps, progress: as in `fit`.
-    """
-    network.eval()
-    network.elbows.train()
-
-    def elbows(batch: Windows) -> Tensor:
-        with torch.no_grad():
-            features = network.features(batch.lab, avg_pool2d(batch.maps, 2), batch.faces)
-        return network.logits_of_elbows(features)
-
-    parameters = [*network.elbows.parameters(), network.elbows_gone]
-    _descend(elbows, _ELBOWS, parameters, clips, steps, progress)
-    return network.eval().requires_grad_(False)
-
-
-def _descend(
-    logits: Callable[[Windows], Tensor],
-    joints: slice,
-    parameters: Sequence[nn.Parameter],
-    clips: Sequence[tuple[str, Windows]],
-    steps: int,
-    progress: bool,
-) -> None:
-    """Fit parameters to the labels of some joints.
-
-    Args:
-        logits: of these joints in windows. joints: among the labelled ones.
-    """
     by_person: dict[str, list[Windows]] = {}
     for person, windows in clips:
         by_person.setdefault(person, []).append(windows)
     persons = list(by_person.values())
-    optimiser = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=_DECAY)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
     for _ in tqdm(range(steps), disable=not progress, desc="fitting"):
         batch = _changed(_drawn(persons))
         with torch.autocast("cpu", torch.bfloat16):
-            found = logits(batch)
-        loss = _loss(found.float(), batch.places[:, joints], batch.seen[:, joints])
+            logits = network(batch.lab, avg_pool2d(batch.maps, 2), batch.faces)
+        loss = sum(
+            weight * _loss(logits[:, part].float(), batch.places[:, part], batch.seen[:, part])
+            for part, weight in _PARTS
+        )
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
+    return network.eval().requires_grad_(False)
 
 
 def _drawn(persons: Sequence[Sequence[Windows]]) -> Windows:

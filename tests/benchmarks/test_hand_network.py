@@ -1,5 +1,7 @@
 """The training of the network of hands: what is changed goes with its labels."""
 
+import math
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from benchmarks.hand_network.clips import BURN_IN, FOLDS, PEOPLE, SIGNERS, Label
 from benchmarks.hand_network.failures import Found, draw_failures, failures
 from benchmarks.hand_network.training import _loss, fit
 from torchpose.measure._body_window import CELL, CELLS, cell_centres
-from torchpose.measure._hand_network import HandPlaces
+from torchpose.measure._hand_network import COARSE, HandPlaces
 
 
 def windows(count=6, seed=0):
@@ -24,7 +26,7 @@ def windows(count=6, seed=0):
         for at in places.unbind(1)
     ]
     maps = torch.stack([*spots, torch.zeros(count, *CELLS), torch.ones(count, *CELLS)], 1)
-    lab = torch.zeros(count, 3, 160, 192)
+    lab = torch.zeros(count, 3, 176, 192)
     faces = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, -1)
     return Windows(lab, maps, faces, places, torch.ones(count, 2, dtype=torch.long))
 
@@ -110,15 +112,15 @@ def test_the_loss_is_least_at_the_label():
     at = (batch.places / 2).long()[0]
 
     def loss(column, row):
-        logits = torch.zeros(1, 2, 40 * 48 + 1)
-        logits[0, :, row * 48 + column] = 5.0
+        logits = torch.zeros(1, 2, math.prod(COARSE) + 1)
+        logits[0, :, row * COARSE[1] + column] = 5.0
         return float(_loss(logits, batch.places, batch.seen))
 
     right = batch._replace(seen=torch.tensor([[1, -1]]))
     batch = right
     assert loss(*at[0].tolist()) < loss(*(at[0] + 6).tolist())
     batch = batch._replace(seen=torch.tensor([[0, 0]]))
-    gone = torch.zeros(1, 2, 40 * 48 + 1)
+    gone = torch.zeros(1, 2, math.prod(COARSE) + 1)
     gone[..., -1] = 12.0
     assert float(_loss(gone, batch.places, batch.seen)) < 0.05 < loss(3, 3)
 
@@ -126,12 +128,12 @@ def test_the_loss_is_least_at_the_label():
 def test_a_fit_is_a_network_that_is_ready_and_the_same_again():
     hands = windows(2)
     both = {name: torch.cat([getattr(hands, name)] * 2, 1) for name in ("places", "seen")}
-    own = hands._replace(lab=torch.zeros(2, 3, 160, 192, dtype=torch.uint8), **both)
+    own = hands._replace(lab=torch.zeros(2, 3, 176, 192, dtype=torch.uint8), **both)
     clips = [("anna", own)]
     one, two = (fit(clips, steps=2, progress=False) for _ in range(2))
     assert not one.training
-    lab, maps = clips[0][1].lab, torch.rand(2, 3, 160, 192)
-    found = [net.find(lab, maps, torch.ones(2, 160, 192), clips[0][1].faces) for net in (one, two)]
+    lab, maps = clips[0][1].lab, torch.rand(2, 3, 176, 192)
+    found = [net.find(lab, maps, torch.ones(2, 176, 192), clips[0][1].faces) for net in (one, two)]
     assert isinstance(found[0], HandPlaces)
     torch.testing.assert_close(found[0].log_prob, found[1].log_prob)
 

@@ -60,6 +60,23 @@ def test_merging_hands_meet_and_swap_sides():
         assert (x > 0.25).double().mean() > 0.2  # apart
 
 
+def test_crossed_arms_are_folded_clasped_and_apart():
+    for seed in (0, 1, 2):
+        clip = performance("crossed arms", 2000, seed=seed)
+        x = clip.joints[:, 0, 0] - clip.joints[:, 7, 0]  # left minus right
+        assert (x < -0.15).double().mean() > 0.05  # on each other's side
+        assert (x > 0.3).double().mean() > 0.1  # apart
+        clasped = torch.tensor([label == "clasped" for label in clip.labels])
+        assert (clip.joints[clasped, 0] - clip.joints[clasped, 7]).norm(dim=-1).min() < 0.1
+
+
+def test_raised_arms_rise_above_the_head_and_are_held_out():
+    for seed in (0, 1, 3):
+        x, y, _ = on_torso(performance("raised arms", 3000, seed=seed)).unbind(-1)
+        assert (y < -0.2).double().mean() > 0.04
+        assert (x.abs() > 0.45).double().mean() > 0.05
+
+
 def test_signers_keep_their_hands_busy_before_chest_and_face():
     clip = performance("signing", 1000)
     hands = on_torso(clip)

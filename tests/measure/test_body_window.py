@@ -73,15 +73,15 @@ def test_the_border_of_the_image():
     within = ((at > whole) & (at < torch.tensor([640.0, 480.0]) - whole)).all(-1)
     assert (inside[0][within] > 0.999).all()
     area = float(inside.double().sum()) * float(whole) ** 2
-    window = anchors[0, :2] - anchors[0, 2] * torch.tensor([4.8, 2.4])
-    size = anchors[0, 2] * torch.tensor([9.6, 8.0])
+    window = anchors[0, :2] - anchors[0, 2] * torch.tensor([4.8, 3.2])
+    size = anchors[0, 2] * torch.tensor([9.6, 8.8])
     low, high = (window + 0.5).clamp_min(0), (window + size + 0.5).minimum(torch.tensor([640, 480]))
     assert area == pytest.approx(float((high - low).prod()), rel=1e-5)
 
 
 def test_a_window_beside_the_image_is_no_error():
     anchors = place_windows(torch.tensor([[5000.0, -3000.0, 40.0]]))
-    assert cut_windows(ramp(48, 64), anchors)[0].shape == (320, 384, 3)
+    assert cut_windows(ramp(48, 64), anchors)[0].shape == (352, 384, 3)
     assert inside_image(anchors, 64, 48).sum() == 0
 
 
@@ -113,7 +113,7 @@ def test_what_is_in_the_image_stays_there_when_a_window_moves():
 
     def bump(anchors):
         at = cell_centres().double() - (pixels_to_cells(spot, anchors)[0, 0] + 0.5) * CELL
-        at = at - torch.tensor([-4.8, -2.4])
+        at = at - torch.tensor([-4.8, -3.2])
         return (-0.5 * (at * anchors[0, 2] / 20).square().sum(-1)).exp()[None, None].float()
 
     torch.testing.assert_close(move_maps(bump(old), old, new), bump(new), atol=0.03, rtol=0)

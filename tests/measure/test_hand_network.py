@@ -32,9 +32,9 @@ PERSON = [(320.0, 120.0, 76.0)]
 
 def windows(count=1, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    lab = torch.randint(0, 255, (count, 3, 160, 192), dtype=torch.uint8, generator=generator)
-    maps = torch.rand(count, 3, 160, 192, generator=generator)
-    return lab, maps, torch.ones(count, 160, 192), FACE.expand(count, -1)
+    lab = torch.randint(0, 255, (count, 3, 176, 192), dtype=torch.uint8, generator=generator)
+    maps = torch.rand(count, 3, 176, 192, generator=generator)
+    return lab, maps, torch.ones(count, 176, 192), FACE.expand(count, -1)
 
 
 def inputs(count=1):

@@ -1,10 +1,12 @@
 """Persons of a video who leave, return and cross, rendered."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from torchpose import VideoTracker
+from torchpose import VideoTracker, load_prior
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.priors import UpperBodyPrior
@@ -43,6 +45,20 @@ def pair():
 @pytest.fixture(scope="module")
 def two_persons(pair):
     return rendered(*pair)
+
+
+def test_bones_alone_track_unless_the_prior_knows_others():
+    shipped = load_prior("kinect-upper-body-small")
+    assert VideoTracker(shipped, demo_camera()).tracker.method == "articulated"
+    assert VideoTracker(shipped, demo_camera(), smoothing="full").smoother.method == "articulated"
+    assert VideoTracker(shipped, demo_camera(), height=1.7).tracker.method == "articulated"
+    assert VideoTracker(shipped, demo_camera(), steady=True).tracker.method == "window-mixture"
+    named = VideoTracker(shipped, demo_camera(), method="multiple-model")
+    assert named.tracker.method == "multiple-model"
+    for persons in ((), (*shipped.info.persons, "somebody else")):
+        info = replace(shipped.info, persons=persons)
+        own = UpperBodyPrior(shipped.left, shipped.right, info, windows=shipped.windows)
+        assert VideoTracker(own, demo_camera()).tracker.method == "multiple-model"
 
 
 def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person):

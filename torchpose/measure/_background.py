@@ -232,8 +232,8 @@ class MotionState(NamedTuple):
     """Holds the last frame of N persons.
 
     Attributes:
-        last, median: Lab in bytes [N, 3, 160, 192], smoothed. grey: [N, 160, 192].
-        flow: from the last frame back to the one before, pixels of `grey` [N, 160, 192, 2].
+        last, median: Lab in bytes [N, 3, 176, 192], smoothed. grey: [N, 176, 192].
+        flow: from the last frame back to the one before, pixels of `grey` [N, 176, 192, 2].
         frames: seen so far [N].
     """
 
@@ -307,12 +307,12 @@ class Motion(nn.Module):
         """Compare the next frame with the frames before.
 
         Args:
-            state: from `init` or the step before. small: windows in Lab, smoothed [N, 3, 160, 192].
-            grey: windows [N, 160, 192], lightness in bytes.
+            state: from `init` or the step before. small: windows in Lab, smoothed [N, 3, 176, 192].
+            grey: windows [N, 176, 192], lightness in bytes.
 
         Returns:
-            The next state; difference from the last frame and from the median [N, 160, 192], 0 to 1;
-            flow from this frame back to the last one, in cells [N, 80, 96, 2].
+            The next state; difference from the last frame and from the median [N, 176, 192], 0 to 1;
+            flow from this frame back to the last one, in cells [N, 88, 96, 2].
         """
         new, last, median = state.frames == 0, state.last, state.median
         if bool(new.any()):

@@ -45,16 +45,17 @@ __all__ = [
 ]
 
 CELL = 0.1  # side of a cell, in B
-CELLS = (80, 96)  # rows and columns of cells
+CELLS = (88, 96)  # rows and columns of cells
 EVIDENCE, COLOURS = 2, 4  # pixels of the finer maps for each cell
-_LEFT, _TOP = -0.5 * CELLS[1] * CELL, -2.4  # edges, in B from the anchor
+_LEFT, _TOP = -0.5 * CELLS[1] * CELL, -3.2  # edges, in B from the anchor
+_STEP = 12  # a window's columns are a multiple of this, so that its rows are whole pixels too
 _FINEST = 3  # up to this many pixels to one are averaged; of more, some are left out
 
 
 def place_windows(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Return anchors (x, y, B) near faces, such that the window consists of whole pixels.
 
-    The place differs from the face's by less than 1 % of B, the size by about 1 %. A window of whole
+    The place differs from the face's by less than 1 % of B, the size by about 2 %. A window of whole
     pixels is quicker to cut than one between the pixels.
     """
     check_shape("faces", faces, ["N", 3])
@@ -62,7 +63,7 @@ def place_windows(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         raise InputError(f"faces must be finite and of positive size, got {faces.tolist()}")
     faces = faces.double()
     step = _pixels_to_one(faces[:, 2])
-    columns = (CELLS[1] * CELL * faces[:, 2] / step / 6).round().clamp_min(1) * 6
+    columns = (CELLS[1] * CELL * faces[:, 2] / step / _STEP).round().clamp_min(1) * _STEP
     size = columns * step / (CELLS[1] * CELL)
     corner = faces[:, :2] + size[:, None] * faces.new_tensor([_LEFT, _TOP]) + 0.5
     corner = (corner / step[:, None]).round() * step[:, None] - 0.5
@@ -97,7 +98,7 @@ def follow_faces(
 def cut_windows(
     image: Image, anchors: Float[Tensor, "N 3"], replicate: bool = True
 ) -> list[NDArray[np.uint8]]:
-    """Return the image in each window, [320, 384] (or with channels), four pixels for a cell.
+    """Return the image in each window, [352, 384] (or with channels), four pixels for a cell.
 
     OpenCV cuts and resizes, one person at a time: parts of an image of different sizes are no tensor.
     The image is averaged over whole blocks of pixels, then resized by bilinear interpolation.
@@ -127,7 +128,7 @@ def cut_windows(
 def cut_colours(
     frame: Image, anchors: Float[Tensor, "N 3"], part: tuple[slice, slice]
 ) -> tuple[UInt8[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"], UInt8[Tensor, "N 3 p q"]]:
-    """Return the windows in Lab, bytes [N, 3, 160, 192], the same smoothed, and a finer part [N, 3, p, q].
+    """Return the windows in Lab, bytes [N, 3, 176, 192], the same smoothed, and a finer part [N, 3, p, q].
 
     By OpenCV, for one person after the other, as in `cut_windows`.
 
@@ -151,7 +152,7 @@ def cut_colours(
 
 
 def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:
-    """Return the windows of a mask of 0 and 255, as shares [N, 160, 192].
+    """Return the windows of a mask of 0 and 255, as shares [N, 176, 192].
 
     Args:
         mask: [H, W]. anchors: from `place_windows`.

@@ -192,8 +192,8 @@ class HandSettings:
         elbow_bias: added to a network's log-odds that an elbow is not visible.
         elbow_reach: scale of the density of an elbow about its expected place, given the hand.
         beside_network: weight of all other cues beside a network's.
-        exclusion_beside_network: takes the place of `exclusion` beside a network, which knows hands that
-            are joined and tells left from right itself.
+        exclusion_beside_network, crossing_beside_network: take the places of `exclusion` and `crossing`
+            beside a network, which knows hands that are joined and tells left from right itself.
         gone_bias: added to a network's log-odds that a hand is gone: those of strangers look less like hands.
         gone_weight: share of a frame's log-odds that a hand is gone that counts; frames are alike.
         gone_stay: probability that it is still gone, or still there, in the next frame.
@@ -249,6 +249,7 @@ class HandSettings:
     elbow_reach: float = 0.6
     beside_network: float = 0.5
     exclusion_beside_network: float = 0.8
+    crossing_beside_network: float = 0.7
     gone_bias: float = -2.0
     gone_weight: float = 0.5
     gone_stay: float = 0.97

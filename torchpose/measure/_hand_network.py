@@ -33,7 +33,7 @@ _MAPS, _COLOURS, _PLACES = (
     3,
     3,
 )  # inputs: skin, two kinds of motion, image; Lab; x, y, near the face
-_WIDTHS = (12, 24, 8, 32, 48, 64)
+_WIDTHS = (12, 20, 8, 24, 40, 56)
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class HandNetworkInfo:
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
 
-_KIND = FileKind("torchpose-hands", 3, HandNetworkInfo)
+_KIND = FileKind("torchpose-hands", 4, HandNetworkInfo)
 
 
 class HandPlaces(NamedTuple):
     """Holds the output of a network about both hands and both elbows of N persons.
 
     Attributes:
-        log_prob: log-probability of each cell, given that the hand is visible [N, 2, 80, 96].
+        log_prob: log-probability of each cell, given that the hand is visible [N, 2, 88, 96].
         gone: log-odds that the hand is not visible [N, 2].
         elbows, elbows_gone: the same for the elbows; of no joints where these were not asked for.
     """
@@ -77,12 +77,12 @@ class HandPlaces(NamedTuple):
 class HandNetwork(nn.Module):
     """Computes the probability of each hand in every cell of a window, and that it is not to be seen.
 
-        q(x or gone | window) = softmax(logits),   x over 40 x 48 cells of 0.2 B
+        q(x or gone | window) = softmax(logits),   x over 44 x 48 cells of 0.2 B
 
     A convolutional network of three scales sees the window's colours relative to those of the face (40 of L,
     12 of a and b are one), the maps of skin and motion, where the image ends, and each cell's place
     relative to the face, in B. The logit of a hand that is not to be seen is a constant: a hand is there
-    if some cell looks enough like it, whoever the person is. 0.23 million parameters.
+    if some cell looks enough like it, whoever the person is. 0.17 million parameters.
 
     Args:
         info: facts about the fit.
@@ -106,7 +106,7 @@ class HandNetwork(nn.Module):
         self.to_high = UpwardLayer(middle, high, high)
         self.places = nn.Conv2d(high, 2, 1)
         self.gone = nn.Parameter(torch.zeros(2))
-        self.elbows = nn.Sequential(Layer(2 * high, high), nn.Conv2d(high, 2, 1))
+        self.elbows = nn.Sequential(Layer(2 * high, high, 1), nn.Conv2d(high, 2, 1))
         self.elbows_gone = nn.Parameter(torch.zeros(2))
 
     def forward(
@@ -116,13 +116,13 @@ class HandNetwork(nn.Module):
         faces: Float[Tensor, "N 3"],
         elbows: bool = True,
     ) -> Float[Tensor, "N J cells"]:
-        """Return the logits of 40 x 48 cells, row by row, and of a joint that is not visible.
+        """Return the logits of 44 x 48 cells, row by row, and of a joint that is not visible.
 
         Both hands come first, then both elbows.
 
         Args:
             colours: of `relative_colours`, two pixels for a cell. maps: skin, difference from the last frame
-                and from the median, and the share inside the image, half a cell for each [N, 4, 40, 48].
+                and from the median, and the share inside the image, half a cell for each [N, 4, 44, 48].
             faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
         """
         features = self.features(colours, maps, faces)
@@ -167,8 +167,8 @@ class HandNetwork(nn.Module):
         """Return the places of the hands in windows of persons.
 
         Args:
-            lab: bytes, two pixels for a cell [N, 3, 160, 192]. maps: skin, difference from the last frame and
-                from the median [N, 3, 160, 192]. inside: share of each pixel in the image.
+            lab: bytes, two pixels for a cell [N, 3, 176, 192]. maps: skin, difference from the last frame and
+                from the median [N, 3, 176, 192]. inside: share of each pixel in the image.
             faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
         """
         every = torch.cat([_coarse(maps), _coarse(inside[:, None])], 1)

@@ -60,7 +60,7 @@ class HandState(NamedTuple):
     Attributes:
         identity: number of each person. anchors: of the windows (x, y, B), pixels.
         skin, memory, motion: of the parts.
-        belief: probability of each hand in each cell, if it is seen; sums to one [N, 2, 80, 96].
+        belief: probability of each hand in each cell, if it is seen; sums to one [N, 2, 88, 96].
         gone: probability that each hand is not to be seen [N, 2].
         size: B, slowly averaged, pixels.
         place: of the hands in the last frame, pixels. speed: pixels per frame.
@@ -344,10 +344,12 @@ class HandTracker(nn.Module):
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()
-        exclusion = s.exclusion if self.network is None else s.exclusion_beside_network
+        exclusion, crossing = s.exclusion, s.crossing
+        if self.network is not None:
+            exclusion, crossing = s.exclusion_beside_network, s.crossing_beside_network
         return exclude(
             predicted * weight,
-            exclusion, s.exclusion_radius / CELL, s.crossing, s.crossing_soft / CELL,
+            exclusion, s.exclusion_radius / CELL, crossing, s.crossing_soft / CELL,
         )  # fmt: skip
 
     def _measure(

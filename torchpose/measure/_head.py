@@ -34,7 +34,7 @@ _FIRST = 7  # frames that are averaged with equal weights
 _HAND = 0.2  # probability of a hand above which the average adapts slowly
 # Ellipse of the head, and rectangle of the neck, in B from the face's centre.
 _HEAD_AXES, _HEAD_DOWN, _NECK, _SOFT = (0.575, 0.8), -0.05, (0.42, 0.4, 1.05), 0.06
-_PART_ROWS, _PART_COLUMNS = slice(0, 54), slice(24, 72)  # cells of the window where a head can be
+_PART_ROWS, _PART_COLUMNS = slice(8, 62), slice(24, 72)  # cells of the window where a head can be
 
 
 class FaceOffsets(NamedTuple):
@@ -201,7 +201,7 @@ class FaceMemory(nn.Module):
             state: from `init` or the step before.
             lab: `head_part` of the windows, bytes as OpenCV has them [N, 3, 216, 192].
             faces: (x, y, B), pixels, B steady. anchors: of the windows, pixels.
-            hands: probability that a cell belongs to a hand [N, 80, 96].
+            hands: probability that a cell belongs to a hand [N, 88, 96].
 
         Returns:
             The next state, and a mask at every pixel of evidence of `head_part` [N, 108, 96]: one on

@@ -32,10 +32,12 @@ from torchpose.measure._upper_body_measurer import (
     MeasurerState,
     UpperBodyMeasurer,
 )
+from torchpose.priors._arms import shipped_arm_prior
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._estimator_table import BONES, method_options
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._tracker_options import TrackerOptions
+from torchpose.upper_body._tracker_options import MethodOptions, TrackerOptions
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 from torchpose.video._measurers import (
     Found,
@@ -128,7 +130,9 @@ class VideoTracker(nn.Module):
         min_confidence: treat keypoints of a detector as missing below this confidence (default 0.3).
         max_gap: the time without measurements after which a person has no pose, seconds; None for never.
         seed: the seed of methods that draw; every person has a generator.
-        **options: further options of `UpperBodyTracker`, such as method, smoothing or frame.
+        **options: further options of `UpperBodyTracker`, such as method, smoothing or frame. The method is
+            "articulated" by default where its prior over arms knows all persons of `prior`, as it does those
+            of the shipped ones, and where no option of another method is given; else as there.
 
     Raises:
         InputError, CameraError, PriorError: as those.
@@ -183,6 +187,8 @@ class VideoTracker(nn.Module):
             )  # fmt: skip
             self.measurer = _keypoint_measurer(detector, fps, max_persons, min_confidence)
             options.setdefault("neck", self.measurer.neck)
+        if detector is None:
+            options["method"] = options.get("method") or _method_of(prior, options)
         self.candidates = candidates
         smoothing = options.pop("smoothing", None)
         tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
@@ -353,6 +359,14 @@ def _keypoint_measurer(
         loaded = check_detector(detector, name)
     least = LEAST_CONFIDENCE if min_confidence is None else min_confidence
     return KeypointMeasurer(loaded, fps, max_persons, least, name)
+
+
+def _method_of(prior: UpperBodyPrior, options: TrackerOptions) -> str | None:
+    """Return bones alone where these know everybody that the prior knows, else None for the usual choice."""
+    of_others = {"window", "steady", *MethodOptions.__annotations__} - set(method_options(BONES))
+    persons = set(prior.info.persons)
+    known = bool(persons) and persons <= set(shipped_arm_prior().info.persons)
+    return BONES if known and of_others.isdisjoint(options) else None
 
 
 def _refuse_measurer(**given: bool) -> None:

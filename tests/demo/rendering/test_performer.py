@@ -1,6 +1,6 @@
 """Rendered frames: the face is found, parts are where the truth is, near ones hide far ones."""
 
-from itertools import pairwise
+from itertools import cycle, pairwise
 
 import cv2
 import numpy as np
@@ -42,7 +42,7 @@ def test_the_face_is_found_where_it_is(distance):
         for name in PERFORMANCES
     ]
     found, sizes, places, extra = 0, [], [], 0
-    for clip, look in zip(clips, [*LOOKS, "dark sleeves"], strict=True):
+    for clip, look in zip(clips, cycle(LOOKS), strict=False):
         frames = render_performance(clip, CAMERA, scene=STILL, look=look)
         for image, joints in zip(frames, clip.joints, strict=True):
             boxes = detector(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).numpy()
@@ -53,7 +53,7 @@ def test_the_face_is_found_where_it_is(distance):
             if near.any():
                 sizes.append(boxes[near][0, 2] / size)
                 places.append((boxes[near][0, :2] - expected) / size)
-    assert found >= 0.95 * 24
+    assert found >= 0.95 * 6 * len(clips)
     assert extra <= 2
     assert np.abs(np.mean(places, 0)).max() < 0.08
     if distance < 2:  # farther away all sizes below the detector's smallest are missing
