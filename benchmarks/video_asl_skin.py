@@ -28,7 +28,7 @@ from benchmarks._table_file import TableFile
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose.measure import SkinMixtureModel
 from torchpose.measure._face import FaceTracker
-from torchpose.measure._skin import SkinModel, rgb_to_lab
+from torchpose.measure._skin import SkinModel, parts_of_persons, rgb_to_lab
 from torchpose.video import open_video
 
 SCALE = 4
@@ -57,7 +57,7 @@ class BackProjection(torch.nn.Module):
 
     def step(self, state: Any, lab: Tensor, faces: Tensor) -> tuple[Any, Tensor]:
         bins = self.model.bins(lab)
-        state = self.model.learn(state, bins, faces)
+        state = self.model.learn(state, bins, parts_of_persons(faces, bins.shape[1:]))
         histogram = state.face.sum(1).flatten(1)
         table = histogram / histogram.amax(1, keepdim=True)
         return state, table.gather(1, (bins % table.shape[1]).flatten(1)).view(bins.shape)

@@ -110,7 +110,13 @@ class _Recorder(HandNetwork):
     """Keeps what a network is asked, and says nothing."""
 
     def find(
-        self, lab: Tensor, maps: Tensor, inside: Tensor, faces: Tensor, elbows: bool = True
+        self,
+        lab: Tensor,
+        maps: Tensor,
+        inside: Tensor,
+        faces: Tensor,
+        elbows: bool = True,
+        seen: Tensor | None = None,
     ) -> HandPlaces:
         """Return an even density of hands that are seen."""
         self.asked = lab, torch.cat([maps, inside[:, None]], 1), faces
@@ -203,7 +209,7 @@ def measure(
             row = _person(found.faces, clip.labels.nose[t])
             if row is not None:
                 hands = HandMeasurements(*(value[row] for value in found.hands))
-                yield t, row, hands, state.hands.anchors[row]
+                yield t, row, hands, state.seen.windows.anchors[row]
 
 
 def found_hands(clip: Clip) -> tuple[Tensor, Tensor, tuple[int, int]]:

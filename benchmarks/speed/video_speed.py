@@ -141,14 +141,16 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
     hands = measurer.hand_tracker
     spent: dict[str, float] = {}
     parts = [
-        ("faces: detection and tracks", measurer, "follow_faces"),
-        ("hands: all", hands, "step"),
+        ("faces: detection and tracks", measurer, "_follow_faces"),
+        ("hands: all", hands, "look"),
+        ("hands: all", hands, "find"),
         ("- skin", hands.skin, "learn"),
         ("- skin", hands.skin, "find"),
         ("- face memory", hands.memory, "step"),
         ("- motion and optical flow", hands.motion, "step"),
         ("- likelihood", hands.likelihood, "means"),
         ("- likelihood", hands.likelihood, "forward"),
+        ("- network", hands.network, "see_colours"),
         ("- network", hands.network, "find"),
         ("- beliefs over cells", hands, "_filter"),
         ("who is who", measurer.register, "step"),
@@ -172,7 +174,9 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
     total = sum(value for name, value in spent.items() if not name.startswith("-"))
     rows.append(("sum", f"{1e3 * total / n_frames:.2f}"))
     report.table(("stage", "ms a frame"), rows)
-    report.add("Decoding and faces run in one thread, hands in another, poses in a third.")
+    report.add(
+        "Decoding, faces, and what images alone tell of hands run in one thread, the rest in another."
+    )
 
 
 def timed(call: Any, name: str, spent: dict[str, float]) -> Any:

@@ -62,7 +62,7 @@ class Says(HandNetwork):
             self.elbow[y - 1 : y + 2, x - 1 : x + 2] = weight
         self.elbow_gone = -9.0 if elbows else 9.0
 
-    def find(self, lab, maps, inside, faces, elbows=True):
+    def find(self, lab, maps, inside, faces, elbows=True, seen=None):
         count = len(maps)
         return HandPlaces(
             maps.new_zeros(count, 2, *CELLS),
@@ -161,8 +161,8 @@ def test_hands_that_are_gone_are_not_seen_and_come_back():
     _, (state, out) = tracked(Says(*[-3.0] * 5, *[3.0] * 8, *[-3.0] * 8), frames=21)
     seen = [bool(hands.seen.all()) for hands in out]
     assert all(seen[3:5]) and not any(seen[8:13]) and all(seen[16:])
-    assert 0 < float(state.gone.amax()) < 0.05
-    assert torch.equal(out[-1].absent.float(), state.gone.float())
+    assert 0 < float(state.beliefs.gone.amax()) < 0.05
+    assert torch.equal(out[-1].absent.float(), state.beliefs.gone.float())
     assert float(out[12].absent.amin()) > 0.9
 
 
@@ -189,7 +189,9 @@ def test_what_is_unsure_of_being_there_has_a_larger_covariance():
 def test_elbows_are_where_the_network_has_them():
     cell = (60, 45)
     _, (state, out) = tracked(Says(*[-5.0] * 3, elbows=[(cell, 1.0)]), frames=3)
-    place = cells_to_pixels(torch.tensor([[cell, cell]], dtype=torch.float64), state.anchors)
+    place = cells_to_pixels(
+        torch.tensor([[cell, cell]], dtype=torch.float64), state.windows.anchors
+    )
     assert bool(out[-1].elbow_seen.all())
     assert float((out[-1].elbows - place).norm(dim=-1).amax()) < 0.05 * PERSON[0][2]
     _, (_, out) = tracked(Says(*[-5.0] * 3), frames=3)
@@ -199,11 +201,11 @@ def test_elbows_are_where_the_network_has_them():
 def test_of_two_places_the_elbow_is_where_the_hand_lets_it_be():
     """The farther place has half as much weight again, but no arm reaches from there to the hand."""
     _, (state, out) = tracked(Says(*[-5.0] * 6, elbows=[((60, 40), 1.0)]), frames=6)
-    hand = pixels_to_cells(out[-1].points, state.anchors)[0, 0]
+    hand = pixels_to_cells(out[-1].points, state.windows.anchors)[0, 0]
     near, far = (int(hand[0]), int(hand[1]) - 10), (int(hand[0]), int(hand[1]) - 35)
     network = Says(*[-5.0] * 6, elbows=[(near, 1.0), (far, 1.5)])
     _, (state, out) = tracked(network, frames=6)
-    found = pixels_to_cells(out[-1].elbows, state.anchors)[0, 0]
+    found = pixels_to_cells(out[-1].elbows, state.windows.anchors)[0, 0]
     assert float((found - torch.tensor(near)).norm()) < 3
 
 
@@ -252,7 +254,7 @@ def test_what_learns_is_not_folded():
 
 def test_without_a_network_no_hand_is_gone():
     _, (state, out) = tracked(None, frames=2)
-    assert not bool(state.gone.any())
+    assert not bool(state.beliefs.gone.any())
     assert bool(out[-1].absent.isnan().all())
 
 

@@ -111,21 +111,45 @@ def test_persons_come_and_go(prior):
     faces = torch.tensor([(180.0, 110.0, 50.0), (470.0, 130.0, 56.0)], dtype=torch.float64)
     tracker = HandTracker(prior)
     state = tracker.init()
-    assert len(state.identity) == 0
+    assert len(state.beliefs.identity) == 0
     frames = [scene(t, faces.tolist()) for t in range(8)]
     for t in range(4):
         state, hands = tracker.step(state, frames[t], faces[:1], torch.tensor([7]))
-    before = state.belief[0]
+    before = state.beliefs.cells[0]
     state, hands = tracker.step(state, frames[4], faces.flip(0), torch.tensor([3, 7]))
-    assert hands.points.shape == (2, 2, 2) and state.frames.tolist() == [1, 5]
-    assert (state.belief[1] - before).abs().sum() < (state.belief[0] - before).abs().sum()
+    assert hands.points.shape == (2, 2, 2) and state.beliefs.frames.tolist() == [1, 5]
+    assert (state.beliefs.cells[1] - before).abs().sum() < (
+        state.beliefs.cells[0] - before
+    ).abs().sum()
     first, _ = follow(tracker, frames[4:5], faces[1:].tolist(), torch.tensor([3]))
-    torch.testing.assert_close(state.belief[0], first.belief[0], atol=1e-4, rtol=0)
+    torch.testing.assert_close(state.beliefs.cells[0], first.beliefs.cells[0], atol=1e-4, rtol=0)
     state, hands = tracker.step(state, frames[5], faces[1:], torch.tensor([3]))
-    assert state.identity.tolist() == [3] and state.frames.tolist() == [2]
+    assert state.beliefs.identity.tolist() == [3] and state.beliefs.frames.tolist() == [2]
     state, hands = tracker.step(state, frames[6], faces[:0], torch.zeros(0, dtype=torch.long))
-    assert hands.points.shape == (0, 2, 2) and len(state.identity) == 0
+    assert hands.points.shape == (0, 2, 2) and len(state.beliefs.identity) == 0
     assert all(len(x) == 0 for x in leaves(state))
+
+
+def test_windows_may_look_ahead_of_the_beliefs(prior):
+    """Windows that have looked at all frames before the first belief give the same hands."""
+    tracker, faces, number = (
+        HandTracker(prior),
+        torch.tensor([(320.0, 120.0, 76.0)]),
+        torch.tensor([0]),
+    )
+    frames = [scene(t) for t in range(12)]
+    views, windows = [], tracker.init().windows
+    for frame in frames:
+        windows, view = tracker.look(windows, frame, faces, number)
+        views.append(view)
+    state, beliefs = tracker.init(), tracker.init().beliefs
+    for frame, view in zip(frames, views, strict=True):
+        beliefs, ahead = tracker.find(beliefs, view)
+        state, hands = tracker.step(state, frame, faces, number)
+        torch.testing.assert_close(ahead, hands, rtol=0, atol=0, equal_nan=True)
+    assert bool(hands.points.isfinite().all())
+    for now, before in zip(leaves(state), [*leaves(windows), *leaves(beliefs)], strict=True):
+        torch.testing.assert_close(now, before, rtol=0, atol=0, equal_nan=True)
 
 
 def leaves(state):
@@ -136,8 +160,8 @@ def test_every_tensor_of_the_state_has_the_persons_first(tracked):
     state, _ = tracked
     assert isinstance(state, HandState)
     assert all(len(x) == 1 for x in leaves(state))
-    assert state.belief.shape == (1, 2, *CELLS)
-    torch.testing.assert_close(state.belief.sum((2, 3)), torch.ones(1, 2))
+    assert state.beliefs.cells.shape == (1, 2, *CELLS)
+    torch.testing.assert_close(state.beliefs.cells.sum((2, 3)), torch.ones(1, 2))
 
 
 def test_a_window_that_moves_with_its_person_changes_nothing(prior):
@@ -149,7 +173,7 @@ def test_a_window_that_moves_with_its_person_changes_nothing(prior):
         face = torch.tensor([[x, y, b]], dtype=torch.float64)
         state, hands = tracker.step(state or tracker.init(), image, face, torch.tensor([0]))
         errors.append(hands.points[0].numpy() - hands_at(t, x, y, b))
-        anchors.add(tuple(state.anchors[0].tolist()))
+        anchors.add(tuple(state.windows.anchors[0].tolist()))
     assert len(anchors) > 3
     error = np.linalg.norm(np.stack(errors[5:]), axis=-1)
     assert np.median(error) < 10 and error.max() < 0.49 * 60
@@ -199,7 +223,7 @@ def test_a_foreground_mask_hides_skin(prior, clip):
     whole = np.full((480, 640), 255, np.uint8)
     with_mask, _ = tracker.step(tracker.init(), clip[0], faces, number, whole)
     without, _ = tracker.step(tracker.init(), clip[0], faces, number)
-    torch.testing.assert_close(with_mask.belief, without.belief)
+    torch.testing.assert_close(with_mask.beliefs.cells, without.beliefs.cells)
 
 
 def test_expected_hands_are_places_of_rebirth(prior, clip):
@@ -210,10 +234,10 @@ def test_expected_hands_are_places_of_rebirth(prior, clip):
     cov = 100 * torch.eye(2).expand(1, 2, 2, 2)
     with_hint, _ = tracker.step(state, clip[1], faces, number, expected=(place, cov))
     without, _ = tracker.step(state, clip[1], faces, number)
-    assert torch.equal(with_hint.belief[:, 1].argmax(), without.belief[:, 1].argmax())
-    at = cell_centres().double() * state.anchors[0, 2] + state.anchors[0, :2]
+    assert torch.equal(with_hint.beliefs.cells[:, 1].argmax(), without.beliefs.cells[:, 1].argmax())
+    at = cell_centres().double() * state.windows.anchors[0, 2] + state.windows.anchors[0, :2]
     near = (at - place[0, 0].double()).norm(dim=-1) < 20
-    assert with_hint.belief[0, 0][near].sum() > 2 * without.belief[0, 0][near].sum()
+    assert with_hint.beliefs.cells[0, 0][near].sum() > 2 * without.beliefs.cells[0, 0][near].sum()
 
 
 def test_half_the_frame_rate(prior, clip):
@@ -227,15 +251,15 @@ def test_half_the_frame_rate(prior, clip):
 def test_the_likelihood_prefers_the_end_of_a_bare_forearm():
     """Skin from the elbow at the top to the fingers: the cue is what lies beyond."""
     likelihood = HandLikelihood()
-    skin = torch.zeros(1, 3, 2 * CELLS[0], 2 * CELLS[1])
-    skin[:, 0, 60:110, 92:98] = 1.0  # 2.5 B long, 0.3 B wide
+    skin, still = torch.zeros(1, 2 * CELLS[0], 2 * CELLS[1]), torch.zeros(1, 2, *CELLS)
+    skin[:, 60:110, 92:98] = 1.0  # 2.5 B long, 0.3 B wide
     elbow = torch.zeros(1, 2, 2, *CELLS)
     elbow[:, :, 1] = 0.6  # above everything, in B from the anchor
-    score = likelihood(likelihood.means(skin), elbow)[0, 0]
+    score = likelihood(likelihood.means(skin, still), likelihood.shape_places(elbow))[0, 0]
     row, column = divmod(int(score.argmax()), CELLS[1])
     assert abs(column - 47) <= 1 and 44 < row < 55
     plain = HandLikelihood(beyond=0.0, towards=0.0, beside=0.0)
-    along = plain(plain.means(skin), elbow)[0, 0, 36:50, 47]
+    along = plain(plain.means(skin, still), plain.shape_places(elbow))[0, 0, 36:50, 47]
     assert along.max() - along.min() < 0.1 < score[52, 47] - score[40, 47]
 
 
@@ -291,6 +315,10 @@ def test_hands_are_not_born_before_the_face(prior):
     for cost in (0.0, 6.0):
         tracker = HandTracker(prior, HandSettings(face_rebirth=cost, jump=1.0, still=1.0))
         state, _ = tracker.step(tracker.init(), image, faces, torch.tensor([0]))
-        at = cell_centres().double() * state.anchors[0, 2] + state.anchors[0, :2] - faces[0, :2]
-        shares.append(float(state.belief[0][:, at.norm(dim=-1) < 0.5 * 76].sum()))
+        at = (
+            cell_centres().double() * state.windows.anchors[0, 2]
+            + state.windows.anchors[0, :2]
+            - faces[0, :2]
+        )
+        shares.append(float(state.beliefs.cells[0][:, at.norm(dim=-1) < 0.5 * 76].sum()))
     assert shares[1] < 0.02 * shares[0]

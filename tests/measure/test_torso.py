@@ -11,7 +11,7 @@ from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
 from torchpose.measure import UpperBodyMeasurer
 from torchpose.measure._face import FaceTracker
-from torchpose.measure._skin import SkinModel, SkinState
+from torchpose.measure._skin import SkinModel, SkinState, parts_of_persons
 from torchpose.measure._torso_elbows import _supported, clothes_likelihood, elbows_from_torso
 
 cv2 = pytest.importorskip("cv2")
@@ -136,7 +136,9 @@ def test_the_measurer_looks_at_everybody_in_an_image_of_their_own_scale():
     bins = model.byte_bins(
         torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2Lab)).permute(2, 0, 1)[None]
     )
-    skin = model.learn(model.init(3), bins.expand(3, -1, -1), faces)
+    skin = model.learn(
+        model.init(3), bins.expand(3, -1, -1), parts_of_persons(faces, bins.shape[1:])
+    )
     together = measurer._elbows(image, faces, skin)
     assert together.seen.all()
     for n in range(3):
@@ -197,7 +199,7 @@ def test_sleeves_of_a_signer():
         small = cv2.resize(frame, (160, 120), interpolation=cv2.INTER_AREA)
         lab = torch.from_numpy(cv2.cvtColor(small, cv2.COLOR_BGR2Lab)).permute(2, 0, 1)[None]
         bins, face = model.byte_bins(lab), tracks.mean[:1, :3].float() / 4
-        state = model.learn(state, bins, face)
+        state = model.learn(state, bins, parts_of_persons(face, bins.shape[1:]))
         found = elbows_from_torso(clothes_likelihood(model, state, bins), face)
         away = found.points[0] - torch.from_numpy(joints[t, truth]) / 4
         said.append(found.seen.float().mean())

@@ -103,13 +103,13 @@ def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one
     shown = one_person[:30]
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", candidates=True)
     asked = []
-    step = tracker.measurer.hand_tracker.step
+    find = tracker.measurer.hand_tracker.find
 
     def spy(*arguments):
-        asked.append(arguments[5])
-        return step(*arguments)
+        asked.append(arguments[2])
+        return find(*arguments)
 
-    tracker.measurer.hand_tracker.__dict__["step"] = spy
+    tracker.measurer.hand_tracker.__dict__["find"] = spy
     (person,) = tracker(shown)
     given = [e for e in asked if len(e.mean) and bool(e.mean.isfinite().all())]
     assert len(given) >= 25

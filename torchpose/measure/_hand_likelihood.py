@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchpose._core.checks import check_finite, check_rgb, check_shape
 from torchpose._core.images import Image
 from torchpose.errors import InputError
-from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres, halve
+from torchpose.measure._body_window import CELL, CELLS, cell_centres, halve
 from torchpose.measure._face import check_faces
 
 __all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", "no_hands"]
@@ -78,48 +78,59 @@ class HandLikelihood(nn.Module):
     hand_rows: Tensor
     hand_columns: Tensor
 
-    def means(self, maps: Float[Tensor, "N 3 h w"]) -> Float[Tensor, "N 4 r c"]:
+    def means(
+        self, skin: Float[Tensor, "N h w"], motion: Float[Tensor, "N 2 r c"]
+    ) -> Float[Tensor, "N 4 r c"]:
         """Return means about the centre of every cell: skin over a palm, then all maps over a hand.
 
         Args:
-            maps: skin, difference from the last frame and from the median, per pixel of evidence;
-                the border is repeated beyond the window.
+            skin: per pixel of evidence; the border is repeated beyond the window.
+            motion: `over_hands` of the differences from the last frame and from the median.
         """
-        for _ in range(EVIDENCE // 2):
-            maps = halve(maps)
-        palm = self.palm_rows @ maps[:, :1] @ self.palm_columns.T
-        return torch.cat([palm, self.hand_rows @ maps @ self.hand_columns.T], 1)
+        halved = halve(skin[:, None])
+        palm = self.palm_rows @ halved @ self.palm_columns.T
+        return torch.cat([palm, self.hand_rows @ halved @ self.hand_columns.T, motion], 1)
+
+    def over_hands(self, maps: Float[Tensor, "N C h w"]) -> Float[Tensor, "N C r c"]:
+        """Return means of maps over a hand about the centre of every cell; see `means`."""
+        return self.hand_rows @ halve(maps) @ self.hand_columns.T
 
     def forward(
-        self, means: Float[Tensor, "N 4 r c"], elbow: Float[Tensor, "N 2 2 r c"]
+        self,
+        means: Float[Tensor, "N 4 r c"],
+        places: Float[Tensor, "N P 2 r c 2"],
     ) -> Float[Tensor, "N 2 r c"]:
         """Return the log-likelihood of the left and the right hand, up to a constant.
 
         Args:
-            means: see `means`.
-            elbow: (x, y) of the expected elbow of each arm, in B from the anchor.
+            means: see `means`. places: see `shape_places`.
         """
         check_shape("means", means, ["N", 4, *CELLS])
         common = torch.tensordot(self.cues, means.movedim(1, 0), 1)[:, None]
         if not len(self.shape_weights):
             return common.expand(-1, 2, -1, -1)
+        found = nn.functional.grid_sample(
+            means[:, :1] - self.unknown, places.flatten(2, 4), align_corners=False
+        )
+        total = self.unknown * self.shape_weights.sum()
+        shape = self.shape_weights @ found.view(*places.shape[:2], -1) + total
+        return common + shape.view(len(places), 2, *CELLS)
+
+    def shape_places(self, elbow: Float[Tensor, "N 2 2 r c"]) -> Float[Tensor, "N P 2 r c 2"]:
+        """Return the places about every cell and hand whose skin tells the shape, in halves of the window.
+
+        Args:
+            elbow: (x, y) of the expected elbow of each arm, in B from the anchor.
+        """
         places, start, half = _grid()
         to_elbow = elbow - places
         along = to_elbow / (to_elbow.square().sum(2, keepdim=True).sqrt_() + 1e-3)
         across = along.flip(2) * _ACROSS.to(along)
-        grid = self._shape_places(along / half, across / half, start)
-        n, count = len(grid), len(self.shape_weights)
-        found = nn.functional.grid_sample(
-            means[:, :1] - self.unknown, grid.flatten(2, 4), align_corners=False
-        )
-        total = self.unknown * self.shape_weights.sum()
-        shape = self.shape_weights @ found.view(n, count, -1) + total
-        return common + shape.view(n, 2, *CELLS)
+        return self._shape_places(along / half, across / half, start)
 
     def _shape_places(
         self, along: Float[Tensor, "N 2 2 r c"], across: Float[Tensor, "N 2 2 r c"], start: Tensor
     ) -> Float[Tensor, "N P 2 r c 2"]:
-        """Return the places about every cell and hand whose skin tells the shape, in halves of the window."""
         offsets = self.shape_offsets.tolist()
         grid = along.new_empty(len(along), len(offsets), 2, *CELLS, 2)
         for point, (forward, aside) in enumerate(offsets):

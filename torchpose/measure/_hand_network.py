@@ -125,24 +125,47 @@ class HandNetwork(nn.Module):
                 and from the median, and the share inside the image, half a cell for each [N, 4, 44, 48].
             faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
         """
-        features = self.features(colours, maps, faces)
+        return self.logits(self.features_of_colours(colours, maps[:, 3:]), maps, faces, elbows)
+
+    def logits(
+        self,
+        seen: Float[Tensor, "N F r c"],
+        maps: Float[Tensor, "N 4 r c"],
+        faces: Float[Tensor, "N 3"],
+        elbows: bool = True,
+    ) -> Float[Tensor, "N J cells"]:
+        """Return the same logits from the `features_of_colours`."""
+        features = self.features(seen, maps, faces)
         if not elbows:
             return self.logits_of_hands(features)
         return torch.cat([self.logits_of_hands(features), self.logits_of_elbows(features)], 1)
 
+    def features_of_colours(
+        self, colours: Float[Tensor, "N 3 h w"], inside: Float[Tensor, "N 1 r c"]
+    ) -> Float[Tensor, "N F r c"]:
+        """Return the features of every coarse cell that come from the colours alone.
+
+        Args:
+            colours: of `relative_colours`. inside: the share of each coarse cell in the image.
+        """
+        there = inside > 0.5
+        if not bool(there.all()):  # the border of an image goes on beyond it
+            beyond = interpolate(there.to(colours), scale_factor=4.0) == 0
+            colours = colours.masked_fill(beyond, -_MOST)
+        return self.colours(colours)  # type: ignore[no-any-return]
+
     def features(
         self,
-        colours: Float[Tensor, "N 3 h w"],
+        seen: Float[Tensor, "N F r c"],
         maps: Float[Tensor, "N 4 r c"],
         faces: Float[Tensor, "N 3"],
     ) -> Float[Tensor, "N C r c"]:
-        """Return the features of every coarse cell: of its surroundings first, then of the cell itself."""
-        inside = maps[:, 3:] > 0.5
-        if not bool(inside.all()):  # the border of an image goes on beyond it
-            beyond = interpolate(inside.to(colours), scale_factor=4.0) == 0
-            colours = colours.masked_fill(beyond, -_MOST)
-        seen = torch.cat([self.colours(colours), self.maps(maps), _where(faces)], 1)
-        high = self.high(seen)
+        """Return the features of every coarse cell: of its surroundings first, then of the cell itself.
+
+        Args:
+            seen: the `features_of_colours`. maps, faces: see `forward`.
+        """
+        high = self.high(torch.cat([seen, self.maps(maps), _where(faces)], 1))
         middle = self.middle(high)
         low = self.low(middle)
         up = self.to_high(self.to_middle(low, middle), high)
@@ -156,6 +179,16 @@ class HandNetwork(nn.Module):
         """Return the logits of both elbows."""
         return _with_gone(self.elbows(features), self.elbows_gone)
 
+    def see_colours(
+        self,
+        lab: UInt8[Tensor, "N 3 h w"],
+        inside: Float[Tensor, "N h w"],
+        faces: Float[Tensor, "N 3"],
+    ) -> Float[Tensor, "N F r c"]:
+        """Return the features that come from the colours of windows alone; see `find`."""
+        colours = relative_colours(lab, faces)
+        return for_inference(self).features_of_colours(colours, _coarse(inside[:, None]))
+
     def find(
         self,
         lab: UInt8[Tensor, "N 3 h w"],
@@ -163,6 +196,7 @@ class HandNetwork(nn.Module):
         inside: Float[Tensor, "N h w"],
         faces: Float[Tensor, "N 3"],
         elbows: bool = True,
+        seen: Float[Tensor, "N F r c"] | None = None,
     ) -> HandPlaces:
         """Return the places of the hands in windows of persons.
 
@@ -170,9 +204,12 @@ class HandNetwork(nn.Module):
             lab: bytes, two pixels for a cell [N, 3, 176, 192]. maps: skin, difference from the last frame and
                 from the median [N, 3, 176, 192]. inside: share of each pixel in the image.
             faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
+            seen: of `see_colours`, if known.
         """
+        if seen is None:
+            seen = self.see_colours(lab, inside, faces)
         every = torch.cat([_coarse(maps), _coarse(inside[:, None])], 1)
-        logits = for_inference(self)(relative_colours(lab, faces), every, faces, elbows)
+        logits = for_inference(self).logits(seen, every, faces, elbows)
         places, gone = logits[..., :-1], logits[..., -1]
         total = torch.logsumexp(places, -1, keepdim=True)
         here = (places - (total + math.log(4))).unflatten(-1, COARSE)  # four cells share one

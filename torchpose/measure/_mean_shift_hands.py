@@ -22,7 +22,7 @@ from torchpose.measure._hand_likelihood import (
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._mean_shift import mean_shift
 from torchpose.measure._persons import match_states, measure_by_scale, take_rows
-from torchpose.measure._skin import SkinModel, SkinState
+from torchpose.measure._skin import SkinModel, SkinState, parts_of_persons
 
 __all__ = ["MeanShiftHandState", "MeanShiftHandTracker"]
 
@@ -236,7 +236,7 @@ class MeanShiftHandTracker(nn.Module):
         discs = discs < (_HAND_RADIUS * faces[:, 2]).square()[:, None, None, None]
         hands = (discs & tracked[..., None, None]).any(1).to(faces)
         of_each = bins.expand(len(faces), -1, -1)
-        colours = self.skin.learn(state, of_each, faces, hands)
+        colours = self.skin.learn(state, of_each, parts_of_persons(faces, of_each.shape[1:]), hands)
         if self.likelihood == "ratio":
             return colours, self.skin.find(colours, of_each)
         histogram = colours.face.sum(1).flatten(1)  # over a and b: hands are lit otherwise

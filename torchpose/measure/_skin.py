@@ -4,6 +4,7 @@ The paper back-projects the colours of a detected face. Clothes and walls may ha
 the face is compared with the clothes below it and with the image far from the person.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
 from torchpose.measure._face import check_faces
 
-__all__ = ["FACE_PATCH", "SkinModel", "SkinState", "rgb_to_lab"]
+__all__ = ["FACE_PATCH", "PersonParts", "SkinModel", "SkinState", "parts_of_persons", "rgb_to_lab"]
 
 BINS = (8, 32, 32)  # of L, a and b
 _LOWEST, _WIDTH = (0.0, -24.0, -24.0), (12.5, 2.0, 3.0)
@@ -40,6 +41,14 @@ class SkinState(NamedTuple):
     clothes: Float[Tensor, "B 8 32 32"]
     far: Float[Tensor, "B 8 32 32"]
     frames: Int[Tensor, " B"]
+
+
+class PersonParts(NamedTuple):
+    """Holds masks of images of B persons: the middle of the face, the clothes, and what is far from both."""
+
+    face: Bool[Tensor, "B H W"]
+    clothes: Bool[Tensor, "B H W"]
+    far: Bool[Tensor, "B H W"]
 
 
 def rgb_to_lab(images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
@@ -148,7 +157,8 @@ class SkinModel(nn.Module):
         check_shape("lab", lab, [len(state.face), 3, "H", "W"])
         check_faces(faces, len(state.face))
         bins = self.bins(lab)
-        state = self.learn(state, bins, faces.to(self.lowest), hands)
+        parts = parts_of_persons(faces.to(self.lowest), bins.shape[1:])
+        state = self.learn(state, bins, parts, hands)
         return state, self.find(state, bins)
 
     def find(self, state: SkinState, bins: Int[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
@@ -190,19 +200,18 @@ class SkinModel(nn.Module):
         self,
         state: SkinState,
         bins: Int[Tensor, "B H W"],
-        faces: Float[Tensor, "B 3"],
+        parts: PersonParts,
         hands: Float[Tensor, "B H W"] | None = None,
         valid: Bool[Tensor, "B H W"] | None = None,
     ) -> SkinState:
         """Return the state after a frame.
 
         Args:
-            state, faces, hands: see `step`. bins: of every pixel, or of every second one; faces are
-                in pixels of this tensor.
-            valid: which pixels belong to the image; the others are left out.
+            state, hands: see `step`. bins: of every pixel, or of every second one.
+            parts: `parts_of_persons` there. valid: which pixels belong to the image; the others are left out.
         """
         known = state.frames > 0
-        patch, clothes, far = self._parts(bins, faces, hands, valid)
+        patch, clothes, far = self._colours(bins, parts, hands, valid)
         hair = known[:, None] & (self.log_ratio(state).flatten(1) <= _HAIR)
         skin = torch.where(hair, 0.0, patch[:, 0])
         least = torch.where(known, _LEAST_FACE * patch.sum((1, 2)), 0.0)
@@ -215,13 +224,13 @@ class SkinModel(nn.Module):
         mixed = old.lerp(self._smoothed(counts), share)
         return SkinState(mixed[:, 0], mixed[:, 1], mixed[:, 2], state.frames + 1)
 
-    def _parts(
-        self, bins: Tensor, faces: Tensor, hands: Tensor | None, valid: Tensor | None
+    def _colours(
+        self, bins: Tensor, parts: PersonParts, hands: Tensor | None, valid: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the colours of the face and of hands in front of it [B, 2, C], clothes and far [B, C]."""
-        face, clothes, far = _regions(faces, bins.shape[1:])
+        face, clothes, far = parts
         if hands is not None:
-            clothes &= hands < _HAND_ELSEWHERE
+            clothes = clothes & (hands < _HAND_ELSEWHERE)
         label = face.byte() + 3 * clothes.byte() + 4 * far.byte()
         if hands is not None:
             label += face & (hands >= _HAND_IN_FACE)
@@ -261,14 +270,12 @@ def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
     )
 
 
-def _regions(
-    faces: Float[Tensor, "B 3"], shape: torch.Size
-) -> tuple[Bool[Tensor, "B H W"], Bool[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
-    """Return masks of the middle of the face, of the clothes, and of what is far from the person."""
+def parts_of_persons(faces: Float[Tensor, "B 3"], shape: Sequence[int]) -> PersonParts:
+    """Return where the parts of persons are, given their faces (x, y, size), and the shape of the image."""
     height, width = shape
     x, y, size = (column[:, None] for column in faces.unbind(1))
     across = ((torch.arange(width, device=faces.device) - x) / size).abs()[:, None]
     down = ((torch.arange(height, device=faces.device) - y) / size)[:, :, None]
     face = (down > FACE_PATCH[1]) & (down < FACE_PATCH[2]) & (across < FACE_PATCH[0])
     clothes = (down > _CLOTHES[1]) & (across < _CLOTHES[0])
-    return face, clothes, (down < _FAR[1]) | (across > _FAR[0])
+    return PersonParts(face, clothes, (down < _FAR[1]) | (across > _FAR[0]))

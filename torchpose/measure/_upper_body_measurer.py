@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,9 +17,10 @@ from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, scale
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
-from torchpose.measure._hands import HandTracker
+from torchpose.measure._hand_windows import HandView, WindowState
+from torchpose.measure._hands import HandBeliefs, HandTracker
 from torchpose.measure._head import FACE_OFFSETS, WITHOUT_ELBOWS, HeadNeck
-from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
+from torchpose.measure._mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
 from torchpose.measure._persons import PersonRegister, Persons, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinState, rgb_to_lab
 from torchpose.measure._torso_elbows import Elbows, clothes_likelihood, elbows_from_torso
@@ -31,6 +32,8 @@ __all__ = [
     "Candidates",
     "FrameMeasurements",
     "MeasurerState",
+    "PersonsView",
+    "SeenPersons",
     "UpperBodyMeasurer",
     "rounded_covariance",
 ]
@@ -79,13 +82,42 @@ class Candidates(NamedTuple):
     covariance: Tensor
 
 
-class MeasurerState(NamedTuple):
-    """Holds faces, persons and hands of the frames before, and the number of those frames."""
+class SeenPersons(NamedTuple):
+    """Holds what the images so far tell of persons, apart from beliefs about their hands.
+
+    Attributes:
+        faces, persons: tracked and numbered. windows: about the faces; None for mean shift.
+        frame: number of frames before.
+    """
 
     faces: FaceTracks
     persons: Persons
-    hands: Any
+    windows: WindowState | None
     frame: int
+
+
+class PersonsView(NamedTuple):
+    """Holds what the image of a frame shows of N persons.
+
+    Attributes:
+        after: the state for the next frame. faces: (x, y, size) [N, 3]. covariance: [N, 3, 3].
+        number: of each person. foreground: of the background model, if any.
+        hands: what windows show; None for mean shift, and without persons.
+    """
+
+    after: SeenPersons
+    faces: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 3 3"]
+    number: Int[Tensor, " N"]
+    foreground: Image | None
+    hands: HandView | None
+
+
+class MeasurerState(NamedTuple):
+    """Holds what was seen of the persons, and what the hand tracker believes of their hands."""
+
+    seen: SeenPersons
+    hands: HandBeliefs | MeanShiftHandState
 
 
 class UpperBodyMeasurer(nn.Module):
@@ -153,24 +185,38 @@ class UpperBodyMeasurer(nn.Module):
         """Return the state before the first frame, and reset the background model."""
         if self.background is not None:
             self.background.reset()
-        return MeasurerState(
-            self.face_tracker.init(), self.register.init(), self.hand_tracker.init(), 0
-        )
+        seen = SeenPersons(self.face_tracker.init(), self.register.init(), None, 0)
+        if isinstance(self.hand_tracker, HandTracker):
+            windows, beliefs = self.hand_tracker.init()
+            return MeasurerState(seen._replace(windows=windows), beliefs)
+        return MeasurerState(seen, self.hand_tracker.init())
 
-    def follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
-        """Return the faces of the next frame, in pixels of a smaller image where the frame is large.
+    def look(self, seen: SeenPersons, image: Image) -> PersonsView:
+        """Return what the next frame shows of the persons, apart from beliefs about their hands.
 
-        They depend on the images alone, so this part of `step` may run ahead in another thread.
+        It depends on the images alone, so this part of `step` may run ahead in another thread.
 
         Args:
-            tracks: of the frame before. image: RGB, uint8 [H, W, 3].
-
-        Returns:
-            `FaceTracks` in this frame.
+            seen: of the state from `init`, or `after` the frame before. image: RGB, uint8 [H, W, 3].
 
         Raises:
             InputError: another kind of image.
         """
+        tracks = self._follow_faces(seen.faces, image)
+        faces, face_cov, identity, unseen = self._used(tracks, _face_scale(image))
+        detected = unseen <= 2 * self.face_tracker.every
+        persons, number = self.register.step(
+            seen.persons, image, faces, identity, seen.frame, detected
+        )
+        foreground = None if self.background is None else self.background.step(image, faces)
+        windows, hands = seen.windows, None
+        if isinstance(self.hand_tracker, HandTracker) and windows is not None:
+            windows, hands = self.hand_tracker.look(windows, image, faces, number, foreground)
+        after = SeenPersons(tracks, persons, windows, seen.frame + 1)
+        return PersonsView(after, faces, face_cov, number, foreground, hands)
+
+    def _follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
+        """Return the faces of the next frame, in pixels of a smaller image where the frame is large."""
         import cv2
 
         check_rgb("a frame", image)
@@ -184,14 +230,14 @@ class UpperBodyMeasurer(nn.Module):
         self,
         state: MeasurerState,
         image: Image,
-        tracks: FaceTracks | None = None,
+        view: PersonsView | None = None,
         candidates: Mapping[int, Candidates] | None = None,
     ) -> tuple[MeasurerState, FrameMeasurements]:
         """Return the next state and the measurements of the next frame.
 
         Args:
             state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
-            tracks: faces of this frame by `follow_faces`, if that has been called already.
+            view: of this frame by `look`, if that has been called already.
             candidates: hands of these persons by a pose filter; not for "mean-shift".
 
         Returns:
@@ -200,23 +246,11 @@ class UpperBodyMeasurer(nn.Module):
         Raises:
             InputError: another kind of image; candidates for a tracker that takes none.
         """
-        if tracks is None:
-            tracks = self.follow_faces(state.faces, image)
-        faces, face_cov, identity, unseen = self._used(tracks, _face_scale(image))
-        detected = unseen <= 2 * self.face_tracker.every
-        persons, number = self.register.step(
-            state.persons, image, faces, identity, state.frame, detected
-        )
-        foreground = None if self.background is None else self.background.step(image, faces)
-        arguments = (state.hands, image, faces, number, foreground)
-        if candidates is None:
-            hand_state, hands = self.hand_tracker.step(*arguments)
-        elif isinstance(self.hand_tracker, HandTracker):
-            expected = _expected(candidates, number, faces[:, 2])
-            hand_state, hands = self.hand_tracker.step(*arguments, expected)
-        else:
-            raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
-        parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
+        if view is None:
+            view = self.look(state.seen, image)
+        faces, number = view.faces, view.number
+        hand_state, hands = self._hands(state.hands, image, view, candidates)
+        parts = [self.head_neck(faces, view.covariance), (_where_seen(hands), hands.covariance)]
         if len(self.names) > len(MEASURED):
             if self.learnt:
                 found = Elbows(hands.elbows, hands.elbow_covariance, hands.elbow_seen)
@@ -228,7 +262,30 @@ class UpperBodyMeasurer(nn.Module):
         eye = torch.eye(2, dtype=cov.dtype)
         cov = torch.where(keypoints.isfinite().all(-1)[..., None, None], cov, eye)
         measured = FrameMeasurements(number, keypoints, rounded_covariance(cov), faces, hands)
-        return MeasurerState(tracks, persons, hand_state, state.frame + 1), measured
+        return MeasurerState(view.after, hand_state), measured
+
+    def _hands(
+        self,
+        state: HandBeliefs | MeanShiftHandState,
+        image: Image,
+        view: PersonsView,
+        candidates: Mapping[int, Candidates] | None,
+    ) -> tuple[HandBeliefs | MeanShiftHandState, HandMeasurements]:
+        """Return the next state of the hand tracker, and the hands in a frame."""
+        tracker = self.hand_tracker
+        if isinstance(tracker, HandTracker) and isinstance(state, HandBeliefs):
+            expected = None
+            if candidates is not None:
+                expected = _expected(candidates, view.number, view.faces[:, 2])
+            return tracker.find(state, view.hands, expected)
+        if isinstance(tracker, HandTracker) or isinstance(state, HandBeliefs):
+            raise InputError(
+                f"expected a state of {type(tracker).__name__}, got {type(state).__name__}; "
+                "begin with init"
+            )
+        if candidates is not None:
+            raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
+        return tracker.step(state, image, view.faces, view.number, view.foreground)
 
     def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> Elbows:
         """Return the elbows from the clothes, in images scaled such that faces have one size.

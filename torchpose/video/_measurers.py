@@ -1,7 +1,7 @@
 """Measure the persons in the frames of a video: by faces and hands, or by a detector of keypoints.
 
-A frame passes two stages. `look` sees what depends on the images alone, the faces, so that it may run
-ahead in another thread. `step` measures the persons, and may use the hands of the last poses.
+A frame passes two stages. `look` sees what depends on the images alone, so that it may run ahead in
+another thread. `step` measures the persons, and may use the hands of the last poses.
 """
 
 from collections.abc import Generator, Iterable, Iterator, Mapping
@@ -11,12 +11,13 @@ import torch
 
 from torchpose._core.images import Image
 from torchpose.errors import InputError
-from torchpose.measure._face import FaceTracks
 from torchpose.measure._keypoint_measurer import FrameKeypoints, KeypointMeasurer, KeypointState
 from torchpose.measure._upper_body_measurer import (
     Candidates,
     FrameMeasurements,
     MeasurerState,
+    PersonsView,
+    SeenPersons,
     UpperBodyMeasurer,
 )
 
@@ -35,10 +36,10 @@ Found = FrameMeasurements | FrameKeypoints
 
 
 class SeenFrame(NamedTuple):
-    """Holds a frame, and the faces in it; None with a detector of keypoints."""
+    """Holds a frame, and what its image shows of persons; None with a detector of keypoints."""
 
     image: Image
-    faces: FaceTracks | None
+    view: PersonsView | None
 
 
 class MeasuredBlock(NamedTuple):
@@ -53,16 +54,21 @@ class MeasuredBlock(NamedTuple):
 class Measurer(Protocol):
     """Protocol of the measurers of `VideoTracker`."""
 
+    @property
+    def heavy(self) -> bool:
+        """Return whether `step` takes so long that a thread of its own is worth while."""
+        ...
+
     def init(self) -> Any:
         """Return the state before the first frame."""
         ...
 
-    def look(self, faces: FaceTracks | None, image: Image) -> SeenFrame:
-        """Return the next frame with its faces, given those of the frame before."""
+    def look(self, seen: SeenPersons | None, image: Image) -> SeenFrame:
+        """Return the next frame with what it shows, given what was seen before."""
         ...
 
-    def faces(self, state: Any) -> FaceTracks | None:
-        """Return the faces of the last frame; None where there are none to follow."""
+    def seen(self, state: Any) -> SeenPersons | None:
+        """Return what was seen before; None where nothing is looked for ahead."""
         ...
 
     def step(
@@ -90,21 +96,26 @@ class FaceStage(NamedTuple):
 
     own: UpperBodyMeasurer
 
+    @property
+    def heavy(self) -> bool:
+        """Return False: most of the work is in `look`, and many threads wait for each other."""
+        return False
+
     def init(self) -> MeasurerState:
         """Return the state before the first frame."""
         return self.own.init()
 
-    def faces(self, state: MeasurerState) -> FaceTracks:
-        """Return the faces of the last frame."""
+    def seen(self, state: MeasurerState) -> SeenPersons:
+        """Return what was seen before."""
         _check_state(state, MeasurerState)
-        return state.faces
+        return state.seen
 
     @torch.no_grad()
-    def look(self, faces: FaceTracks | None, image: Image) -> SeenFrame:
-        """Return the next frame with its faces."""
-        if faces is None:
-            raise InputError("expected the faces of the frame before, got None")
-        return SeenFrame(image, self.own.follow_faces(faces, image))
+    def look(self, seen: SeenPersons | None, image: Image) -> SeenFrame:
+        """Return the next frame with what it shows."""
+        if seen is None:
+            raise InputError("expected what was seen in the frames before, got None")
+        return SeenFrame(image, self.own.look(seen, image))
 
     @torch.no_grad()
     def step(
@@ -115,7 +126,7 @@ class FaceStage(NamedTuple):
     ) -> tuple[MeasurerState, FrameMeasurements]:
         """Return the next state and the measurements of the next frame."""
         _check_state(state, MeasurerState)
-        return self.own.step(state, frame.image, frame.faces, candidates)
+        return self.own.step(state, frame.image, frame.view, candidates)
 
 
 class DetectorStage(NamedTuple):
@@ -123,17 +134,22 @@ class DetectorStage(NamedTuple):
 
     own: KeypointMeasurer
 
+    @property
+    def heavy(self) -> bool:
+        """Return True: detectors take most of the time."""
+        return True
+
     def init(self) -> KeypointState:
         """Return the state before the first frame."""
         return self.own.init()
 
-    def faces(self, state: KeypointState) -> None:
-        """Return None: keypoints come without faces."""
+    def seen(self, state: KeypointState) -> None:
+        """Return None: keypoints are found in `step`."""
         _check_state(state, KeypointState)
 
-    def look(self, faces: FaceTracks | None, image: Image) -> SeenFrame:
-        """Return the next frame, without faces."""
-        return SeenFrame(image, faces)
+    def look(self, seen: SeenPersons | None, image: Image) -> SeenFrame:
+        """Return the next frame alone."""
+        return SeenFrame(image, None)
 
     @torch.no_grad()
     def step(
@@ -155,11 +171,11 @@ def _check_state(state: Any, kind: type) -> None:
 
 
 def look_ahead(measurer: Measurer, state: Any, images: Iterable[Image]) -> Iterator[SeenFrame]:
-    """Yield frames with their faces, which later frames and poses do not change."""
-    faces = measurer.faces(state)
+    """Yield frames with what they show, which later frames and poses do not change."""
+    seen = measurer.seen(state)
     for image in images:
-        frame = measurer.look(faces, image)
-        faces = frame.faces
+        frame = measurer.look(seen, image)
+        seen = None if frame.view is None else frame.view.after
         yield frame
 
 

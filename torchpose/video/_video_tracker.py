@@ -103,10 +103,10 @@ class VideoTracker(nn.Module):
     [N, J, 2], pixels, and confidence [N, J], 0 to 1, of N persons.
 
     `forward` tracks a recording, `init` and `step` a camera, `advance` some more frames of either. A frame
-    passes three stages, each of which takes and returns values: `Measurer.look` finds the faces,
+    passes three stages, each of which takes and returns values: `Measurer.look` sees what images alone tell,
     `Measurer.step` measures the persons, and `PersonStream.advance_all` turns the measurements into poses
-    by the `UpperBodyTracker`. Of a recording the first two run ahead in threads, and the poses are kept in
-    files until it has ended (`TrackedRecording`).
+    by the `UpperBodyTracker`. Of a recording the first runs ahead in a thread, that of a detector the second
+    too, and the poses are kept in files until it has ended (`TrackedRecording`).
 
     Args:
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
@@ -294,7 +294,7 @@ class VideoTracker(nn.Module):
         ahead = prefetch(look_ahead(self._measurer, start.measurer, _images(frames)))
         with (
             closing(ahead) as seen,  # no thread reads on when the caller gets an error
-            closing(self._blocks(start, seen, size, ahead=True)) as blocks,
+            closing(self._blocks(start, seen, size, self._measurer.heavy)) as blocks,
             tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
         ):
             for state, block, tracked in blocks:
@@ -316,7 +316,7 @@ class VideoTracker(nn.Module):
         With candidates every frame is a block, since it is measured with the poses of the one before.
 
         Args:
-            state: the state before the frames. seen: the frames with their faces.
+            state: the state before the frames. seen: the frames with what they show.
             size: the number of frames of a block; the last one may be shorter.
             ahead: whether frames are measured in another thread while the block before is filtered.
         """
