@@ -31,13 +31,13 @@ from torchpose.measure._head import head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import PersonParts, SkinModel, parts_of_persons
 
-__all__ = ["HandView", "HandWindows", "WindowState"]
+__all__ = ["HandView", "HandWindowState", "HandWindows"]
 
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
 
 
-class WindowState(NamedTuple):
+class HandWindowState(NamedTuple):
     """Holds the windows of N persons, the first dimension of every tensor.
 
     Attributes:
@@ -116,18 +116,18 @@ class HandWindows:
     likelihood: HandLikelihood
     network: HandNetwork | None
 
-    def init(self) -> WindowState:
+    def init(self) -> HandWindowState:
         """Return the state without persons."""
         return take_rows(self._fresh(torch.zeros(1, 3)), slice(0, 0))
 
     def look(
         self,
-        state: WindowState,
+        state: HandWindowState,
         frame: Image,
         faces: Float[Tensor, "N 3"],
         identity: Int[Tensor, " N"],
         foreground: Image | None = None,
-    ) -> tuple[WindowState, HandView]:
+    ) -> tuple[HandWindowState, HandView]:
         """Return the next state and what the windows show in the next frame, of one person at least.
 
         Args:
@@ -162,14 +162,14 @@ class HandWindows:
         state = state._replace(anchors=anchors, motion=motion, frames=state.frames + 1)
         return state, view
 
-    def _fresh(self, anchors: Tensor) -> WindowState:
+    def _fresh(self, anchors: Tensor) -> HandWindowState:
         """Return the state of new persons."""
         number = torch.zeros(len(anchors), dtype=torch.long)
         anchors = anchors.double()
         motion = self.motion.init(len(anchors))
-        return WindowState(number, anchors, anchors[:, 2], motion, number.clone())
+        return HandWindowState(number, anchors, anchors[:, 2], motion, number.clone())
 
-    def _persons(self, state: WindowState, faces: Tensor, identity: Tensor) -> WindowState:
+    def _persons(self, state: HandWindowState, faces: Tensor, identity: Tensor) -> HandWindowState:
         """Return the state of the persons of this frame."""
         if torch.equal(state.identity, identity):
             return state
@@ -178,7 +178,7 @@ class HandWindows:
         state = match_states(state, self._fresh(anchors[:1]), identity)
         return state._replace(anchors=torch.where(new[:, None], anchors, state.anchors))
 
-    def _steady(self, state: WindowState, faces: Tensor) -> tuple[WindowState, Tensor]:
+    def _steady(self, state: HandWindowState, faces: Tensor) -> tuple[HandWindowState, Tensor]:
         """Return the faces with averaged sizes: a hand in front of a face changes its bounding box only."""
         follow = torch.clamp(1 / (state.frames + 1.0), min=self.settings.face_follow * self.rate)
         off = (faces[:, 2] / state.size).log().abs() > math.log(self.settings.face_change)

@@ -32,7 +32,7 @@ from torchpose.measure._hand_likelihood import (
 )
 from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
-from torchpose.measure._hand_windows import HandView, HandWindows, WindowState
+from torchpose.measure._hand_windows import HandView, HandWindows, HandWindowState
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
@@ -67,50 +67,49 @@ class HandBeliefs(NamedTuple):
 class HandState(NamedTuple):
     """Holds the windows about the faces of some persons, and what is believed of their hands."""
 
-    windows: WindowState
+    windows: HandWindowState
     beliefs: HandBeliefs
 
 
 class HandTracker(nn.Module):
     """Tracks both hands of every person by a histogram filter in a window about the face.
 
-        The likelihood of a hand comes from skin (against clothes and background), motion and the shape
-        of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
-        (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
-        predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
-        other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
-        returned with that frame, without delay.
+    The likelihood of a hand comes from skin (against clothes and background), motion and the shape
+    of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
+    (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
+    predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
+    other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
+    returned with that frame, without delay.
 
-        With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
-        image. That is a state of its own, beside the places, with a probability that is filtered over time.
-        The network also finds the elbows, in each frame alone.
+    With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
+    image. That is a state of its own, beside the places, with a probability that is filtered over time.
+    The network also finds the elbows, in each frame alone.
 
-        `step` is `look`, which the images and faces alone decide and which may run ahead, and then `find`.
+    `step` is `look`, which the images and faces alone decide and which may run ahead, and then `find`.
 
-        Args:
-            prior: of hands given the face.
-            settings: constants. fps: frames per second of the video.
-            network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
-                takes every hand to be somewhere.
-            elbows: whether the network also finds the elbows.
+    Args:
+        prior: of hands given the face.
+        settings: constants. fps: frames per second of the video.
+        network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
+            takes every hand to be somewhere.
+        elbows: whether the network also finds the elbows.
 
-        Raises:
-            InputError: a frame rate that is not positive.
+    Raises:
+        InputError: a frame rate that is not positive.
 
-        Reference:
-            Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
+    Reference:
+        Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
 
-        Example:
-            >>> import numpy as np, torch, torchpose
-            >>> from torchpose.measure import HandTracker
-            >>> from torchpose.measure._hand_prior import HandPrior
-    from torchpose.measure._hand_windows import HandView, HandWindows, WindowState
-            >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
-            >>> frame = np.full((120, 160, 3), 90, np.uint8)
-            >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
-            >>> state, hands = tracker.step(tracker.init(), frame, face, number)
-            >>> hands.points.shape
-            torch.Size([1, 2, 2])
+    Example:
+        >>> import numpy as np, torch, torchpose
+        >>> from torchpose.measure import HandTracker
+        >>> from torchpose.measure._hand_prior import HandPrior
+        >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
+        >>> frame = np.full((120, 160, 3), 90, np.uint8)
+        >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
+        >>> state, hands = tracker.step(tracker.init(), frame, face, number)
+        >>> hands.points.shape
+        torch.Size([1, 2, 2])
     """
 
     def __init__(
@@ -181,17 +180,20 @@ class HandTracker(nn.Module):
     @torch.no_grad()
     def look(
         self,
-        windows: WindowState,
+        windows: HandWindowState,
         frame: Image,
         faces: Float[Tensor, "N 3"],
         identity: Int[Tensor, " N"],
         foreground: Image | None = None,
-    ) -> tuple[WindowState, HandView | None]:
+    ) -> tuple[HandWindowState, HandView | None]:
         """Return the next windows and what they show in the next frame; None without persons.
 
         Args:
             windows: of the state from `init`, or from the frame before.
             frame, faces, identity, foreground: see `step`.
+
+        Returns:
+            The windows for the next frame, and the `HandView` of this one.
 
         Raises:
             InputError, ShapeError: see `step`.
@@ -213,6 +215,9 @@ class HandTracker(nn.Module):
         Args:
             state: the beliefs of the state from `init`, or from the frame before.
             view: from `look`. expected: see `step`.
+
+        Returns:
+            The next beliefs, and `HandMeasurements`.
         """
         if view is None:
             return self._nobody(), no_hands(torch.zeros(0, 3, dtype=torch.float64))

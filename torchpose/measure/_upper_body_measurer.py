@@ -17,7 +17,7 @@ from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, scale
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
-from torchpose.measure._hand_windows import HandView, WindowState
+from torchpose.measure._hand_windows import HandView, HandWindowState
 from torchpose.measure._hands import HandBeliefs, HandTracker
 from torchpose.measure._head import FACE_OFFSETS, WITHOUT_ELBOWS, HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
@@ -92,7 +92,7 @@ class SeenPersons(NamedTuple):
 
     faces: FaceTracks
     persons: Persons
-    windows: WindowState | None
+    windows: HandWindowState | None
     frame: int
 
 
@@ -198,6 +198,9 @@ class UpperBodyMeasurer(nn.Module):
 
         Args:
             seen: of the state from `init`, or `after` the frame before. image: RGB, uint8 [H, W, 3].
+
+        Returns:
+            `PersonsView`, whose `after` is what to look with at the next frame.
 
         Raises:
             InputError: another kind of image.

@@ -1,6 +1,6 @@
 """Track whole bodies: from keypoints or silhouettes in calibrated cameras to the poses of one person."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack, overload
@@ -17,7 +17,7 @@ from torchpose._core.moved import warn_of_former
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
-from torchpose.errors import InputError, NobodySeenError
+from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
@@ -36,27 +36,20 @@ from torchpose.whole_body._filter_table import (
 )
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
-from torchpose.whole_body._first_pose import find_first_pose
-from torchpose.whole_body._following import Observed, all_see, follow
+from torchpose.whole_body._following import Observed
 from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KEYPOINT_METHOD,
     KeypointBodyTracker,
 )
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 from torchpose.whole_body._keypoints.people_body_tracker import PeopleBodyTracker
 from torchpose.whole_body._keypoints.people_tracker import PeopleStream
-from torchpose.whole_body._measured_keypoints import (
-    BodyKeypointMeasurer,
-    GivenKeypoints,
-    given_keypoints,
-    observed_frames,
-)
+from torchpose.whole_body._measured_keypoints import given_keypoints
+from torchpose.whole_body._particle_follower import ParticleFollower
 
 __all__ = ["BodyStream", "BodyTracker"]
 
 _HEIGHT = 1.75  # metres, of a person of unknown height
-_LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 
 
 class BodyStream(NamedTuple):
@@ -180,10 +173,7 @@ class BodyTracker(nn.Module):
             unused = [*given, *options]
             unused += ["process_cov"] * (process_cov is not None)
             unused += ["initial_cov"] * (initial_cov is not None)
-            if unused:
-                raise InputError(
-                    f"{', '.join(unused)} does nothing for method {method}; leave it out"
-                )
+            _refuse(unused, f"for method {method}")
             self.method, self.fps = method, float(fps)
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.by_keypoints = KeypointBodyTracker(
@@ -195,10 +185,7 @@ class BodyTracker(nn.Module):
             return
         unused = [name for name, value in (("motion", motion), ("up", up)) if value is not None]
         unused += ["lifting"] * (not lifting)
-        if unused:
-            raise InputError(
-                f"{', '.join(unused)} does nothing without method={KEYPOINT_METHOD!r}; leave it out"
-            )
+        _refuse(unused, f"without method={KEYPOINT_METHOD!r}")
         height = _HEIGHT if height is None else height
         self.method = choose_method(method, given)
         models = {kind: _model(kind, value, fps) for kind, value in given.items()}
@@ -218,17 +205,19 @@ class BodyTracker(nn.Module):
         self.notes = tuple(filter(None, (note for _, note in models.values())))
         # of the filter where these are the same, so that its tensors are in the state once
         self._upright = None if upright is tracked else upright
-        self._search = (
-            models["manifold"][0] if "manifold" in models and needs != "manifold" else None
-        )
         std = (
             None
             if initial_cov is None
             else std_of_covariance("initial_cov", initial_cov, tracked.dim)
         )
         self.register_buffer("_initial_std", std, persistent=std is not None)
-        self._keypoint_noise = keypoint_std, pixel_std
-        self._measurer: BodyKeypointMeasurer | None = None
+        self._search = (
+            models["manifold"][0] if "manifold" in models and needs != "manifold" else None
+        )
+        self._by_particles = ParticleFollower(
+            self.method, self.filter, self.cameras, self.fps, self._upright, self._search,
+            (keypoint_std, pixel_std),
+        )  # fmt: skip
 
     _initial_std: Tensor | None
 
@@ -240,7 +229,7 @@ class BodyTracker(nn.Module):
     @property
     def upright(self) -> Body:
         """Return the person's body on which the first pose is looked for."""
-        return self.body if self._upright is None else self._upright
+        return self._by_particles.upright
 
     @property
     def process_cov(self) -> Float[Tensor, " D"]:
@@ -342,19 +331,19 @@ class BodyTracker(nn.Module):
                 refine=refine, progress=progress,
             )  # fmt: skip
         self._check_kind(smoothing, refine, persons)
-        source, measured = self._observed(
+        source, measured = self._by_particles.observed(
             silhouettes, given_keypoints(keypoints, confidence, names, covariance)
         )
         frames = source if lengths is None else islice(source, _whole(lengths))
-        begun, first = self._first_seen(frames, measured)
-        looked_at = 1 if initial_state is not None else self._looked_at
+        begun, first = self._by_particles.first_seen(frames, measured)
+        looked_at = 1 if initial_state is not None else self._by_particles.looked_at
         begin = [first, *islice(frames, looked_at - 1)]
         if initial_state is None:
-            initial_state = self._first_state(begin, generator, facing)
+            initial_state = self._by_particles.first_state(begin, generator, facing)
         state = self._begun(initial_state, generator)._replace(frame=begun)
         expected = None if n_frames is None else max(1, n_frames - begun)
         bar = tqdm(chain(begin, frames), total=expected, disable=not progress, unit="frame")
-        poses = self._followed(state, iter(bar))[1]
+        poses = self._tracked(state, iter(bar))[1]
         if lengths is not None:
             there, later = begun + len(poses), sum(1 for _ in source)
             check_lengths(lengths, 1, there + later, lengths.device)
@@ -408,9 +397,17 @@ class BodyTracker(nn.Module):
                     "tracking begins with silhouettes, keypoints or an initial_state, got none"
                 )
             given = given_keypoints(keypoints, confidence, names, covariance)
-            frames = list(self._observed(silhouettes, given)[0])
-            initial_state = self._first_state(frames, generator, facing)
+            frames = list(self._by_particles.observed(silhouettes, given)[0])
+            initial_state = self._by_particles.first_state(frames, generator, facing)
         return self._begun(initial_state, generator)
+
+    def _begun(self, initial_state: Tensor, generator: torch.Generator | None) -> BodyStream:
+        """Return the state of particles before the first frame."""
+        check_shape("initial_state", initial_state, [self.body.dim])
+        state = self.filter.init(
+            initial_state[None], generator=generator, initial_cov=self.initial_cov
+        )
+        return BodyStream(state, 0, generator)
 
     @overload
     def step(
@@ -468,7 +465,7 @@ class BodyTracker(nn.Module):
             given = given_keypoints(keypoints, confidence, names, covariance)
             given = None if given is None else given.alone()
             shown = None if silhouettes is None else [silhouettes]
-            return self._followed(state, self._observed(shown, given)[0])
+            return self._tracked(state, self._by_particles.observed(shown, given)[0])
         if keypoints is None:
             raise InputError(f"method {self.method} takes keypoints, got none")
         if isinstance(state.filter, BodyFilterState):
@@ -510,9 +507,7 @@ class BodyTracker(nn.Module):
         if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
-        return self._followed(state, self._observed(silhouettes, given)[0])
-
-    # --- silhouettes and keypoints of particle filters
+        return self._tracked(state, self._by_particles.observed(silhouettes, given)[0])
 
     def _check_kind(self, smoothing: str, refine: str, persons: str | int | None) -> None:
         """Refuse what the Kalman filter alone does."""
@@ -527,86 +522,13 @@ class BodyTracker(nn.Module):
                 "cameras as they are given"
             )
 
-    def _observed(
-        self, silhouettes: Iterable[Tensor] | None, given: GivenKeypoints | None
-    ) -> tuple[Iterator[Observed], KeypointFrame | None]:
-        """Return the frames one after the other, and the keypoints of all of them."""
-        if given is None:
-            if silhouettes is None:
-                raise InputError(
-                    f"method {self.method} takes silhouettes, keypoints or both, got none"
-                )
-            return map(Observed, silhouettes), None
-        if callable(self.filter.likelihood):
-            raise InputError(
-                "a callable likelihood takes observations of its own; leave out the keypoints"
-            )
-        measured = self._keypoint_measurer.measured(given)
-        return observed_frames(silhouettes, self._keypoint_measurer, measured), measured
-
-    @property
-    def _keypoint_measurer(self) -> BodyKeypointMeasurer:
-        """Return what makes measurements of keypoints; it is set up by the first ones."""
-        if self._measurer is None:
-            self._measurer = BodyKeypointMeasurer(
-                self.cameras, self.fps, self.upright, *self._keypoint_noise
-            )
-        return self._measurer
-
-    @property
-    def _looked_at(self) -> int:
-        return max(1, round(_LOOK_AHEAD * self.fps))
-
-    def _first_seen(
-        self, frames: Iterator[Observed], measured: KeypointFrame | None
-    ) -> tuple[int, Observed]:
-        """Return the first frame in which the person is seen well enough to begin."""
-        if measured is not None:
-            begun = self._keypoint_measurer.first_frame(measured)
-            found = next(((begun, one) for one in islice(frames, begun, None)), None)
-        else:
-            shown = ((t, one) for t, one in enumerate(frames) if all_see(_masks(one)))
-            found = next(shown, None)
-        if found is None:
-            raise NobodySeenError(
-                "nobody is seen by all cameras in any frame; check the silhouettes, or leave out the "
-                "camera that sees nobody"
-            )
-        return found
-
-    def _first_state(
-        self,
-        frames: Sequence[Observed],
-        generator: torch.Generator | None,
-        facing: Tensor | None,
-    ) -> Float[Tensor, " D"]:
-        """Return the pose of the first of some frames: from keypoints where there are any."""
-        keypoints = [one.keypoints.frame for one in frames if one.keypoints is not None]
-        if keypoints:
-            joined = KeypointFrame(*(torch.cat(v) for v in zip(*keypoints, strict=True)))
-            found = self._keypoint_measurer.first_pose(joined)
-        else:
-            found = find_first_pose(
-                self.upright, torch.stack([_masks(one) for one in frames]), self.cameras,
-                self._first_prior(), generator, fps=self.fps, facing=facing,
-            ).state  # fmt: skip
-        return found if self._upright is None else self.upright.convert(found, self.body)
-
-    def _begun(self, initial_state: Tensor, generator: torch.Generator | None) -> BodyStream:
-        check_shape("initial_state", initial_state, [self.body.dim])
-        state = self.filter.init(
-            initial_state[None], generator=generator, initial_cov=self.initial_cov
-        )
-        return BodyStream(state, 0, generator)
-
-    def _followed(
+    def _tracked(
         self, state: BodyStream, frames: Iterable[Observed]
     ) -> tuple[BodyStream, BodyTrack]:
+        """Return the next state and the poses in some frames, by particles."""
         if not isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
-        after, poses = follow(
-            self.filter, state.filter, frames, self.cameras, state.generator, state.frame
-        )
+        after, poses = self._by_particles.follow(state.filter, frames, state.generator, state.frame)
         poses.fps, poses.method = self.fps, self.method
         poses.notes = (*self.notes, *poses.notes)
         return BodyStream(after, state.frame + len(poses), state.generator), poses
@@ -633,22 +555,17 @@ class BodyTracker(nn.Module):
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
 
-    def _first_prior(self) -> Any:
-        """Return the manifold with which the first pose is looked for, or None."""
-        return getattr(self.filter, "manifold", None) if self._search is None else self._search
+
+def _refuse(unused: Sequence[str], where: str) -> None:
+    """Raise `InputError` for arguments that the method does not use."""
+    if unused:
+        raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
 
 
 def _person(body: Body | str | Path | None, height: float) -> Body:
     if isinstance(body, Body):
         return body
     return Body.of_height(BODY_15, height) if body is None else load_body(body)
-
-
-def _masks(one: Observed) -> Tensor:
-    """Return the silhouettes of a frame that has them."""
-    if one.silhouettes is None:
-        raise InputError("expected silhouettes, got none")
-    return one.silhouettes
 
 
 def _whole(lengths: Int[Tensor, "1"]) -> int:

@@ -1,0 +1,156 @@
+"""Begin and follow one person with a particle filter, through silhouettes, keypoints, or both."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.body._kinematics import Body
+from torchpose.camera._rig import CameraRig
+from torchpose.errors import InputError, NobodySeenError
+from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._filters.body_particles import BodyFilterState
+from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body._first_pose import find_first_pose
+from torchpose.whole_body._following import Observed, all_see, follow
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._measured_keypoints import (
+    BodyKeypointMeasurer,
+    GivenKeypoints,
+    observed_frames,
+)
+
+__all__ = ["ParticleFollower"]
+
+_LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
+
+
+@dataclass
+class ParticleFollower:
+    """Finds the first pose of a person, and follows it with a particle filter.
+
+    Attributes:
+        method: name of the filter, for errors. filter: over the poses of a body. cameras: theirs.
+        fps: frames per second.
+        start_body: the body with which the first pose is found; None for the filter's own.
+        start_prior: the manifold in which it is looked for; None for the filter's own, if it has one.
+        noise: of keypoints, metres and pixels; None for the usual ones.
+    """
+
+    method: str
+    filter: SilhouetteParticleFilter
+    cameras: CameraRig
+    fps: float
+    start_body: Body | None
+    start_prior: Any
+    noise: tuple[float | None, float | None]
+    _measurer: BodyKeypointMeasurer | None = field(default=None, init=False)
+
+    @property
+    def upright(self) -> Body:
+        """Return the body on which the first pose is looked for."""
+        own: Any = self.filter.body
+        return own if self.start_body is None else self.start_body
+
+    @property
+    def looked_at(self) -> int:
+        """Return the number of frames in which the first pose is found."""
+        return max(1, round(_LOOK_AHEAD * self.fps))
+
+    @property
+    def measurer(self) -> BodyKeypointMeasurer:
+        """Return what makes measurements of keypoints; it is set up by the first ones."""
+        if self._measurer is None:
+            self._measurer = BodyKeypointMeasurer(self.cameras, self.fps, self.upright, *self.noise)
+        return self._measurer
+
+    def observed(
+        self, silhouettes: Iterable[Tensor] | None, given: GivenKeypoints | None
+    ) -> tuple[Iterator[Observed], KeypointFrame | None]:
+        """Return the frames one after the other, and the keypoints of all of them.
+
+        Args:
+            silhouettes: [C, H, W], frame after frame. given: keypoints of as many frames.
+
+        Raises:
+            InputError: neither of them, or keypoints beside a likelihood of one's own.
+        """
+        if given is None:
+            if silhouettes is None:
+                raise InputError(
+                    f"method {self.method} takes silhouettes, keypoints or both, got none"
+                )
+            return map(Observed, silhouettes), None
+        if callable(self.filter.likelihood):
+            raise InputError(
+                "a callable likelihood takes observations of its own; leave out the keypoints"
+            )
+        measured = self.measurer.measured(given)
+        return observed_frames(silhouettes, self.measurer, measured), measured
+
+    def first_seen(
+        self, frames: Iterator[Observed], measured: KeypointFrame | None
+    ) -> tuple[int, Observed]:
+        """Return the number of the first frame in which the person is seen well enough, and that frame.
+
+        Raises:
+            NobodySeenError: there is none.
+        """
+        if measured is not None:
+            begun = self.measurer.first_frame(measured)
+            found = next(((begun, one) for one in islice(frames, begun, None)), None)
+        else:
+            shown = ((t, one) for t, one in enumerate(frames) if all_see(_masks(one)))
+            found = next(shown, None)
+        if found is None:
+            raise NobodySeenError(
+                "nobody is seen by all cameras in any frame; check the silhouettes, or leave out the "
+                "camera that sees nobody"
+            )
+        return found
+
+    def first_state(
+        self,
+        frames: Sequence[Observed],
+        generator: torch.Generator | None,
+        facing: Tensor | None,
+    ) -> Float[Tensor, " D"]:
+        """Return the pose of the filter's body in the first of some frames: from keypoints if there are any.
+
+        Args:
+            frames: of half a second. generator: of random numbers. facing: where the person looks at first.
+        """
+        keypoints = [one.keypoints.frame for one in frames if one.keypoints is not None]
+        if keypoints:
+            joined = KeypointFrame(*(torch.cat(v) for v in zip(*keypoints, strict=True)))
+            found = self.measurer.first_pose(joined)
+        else:
+            prior = self.start_prior
+            prior = getattr(self.filter, "manifold", None) if prior is None else prior
+            found = find_first_pose(
+                self.upright, torch.stack([_masks(one) for one in frames]), self.cameras, prior,
+                generator, fps=self.fps, facing=facing,
+            ).state  # fmt: skip
+        own: Any = self.filter.body
+        return found if self.start_body is None else self.start_body.convert(found, own)
+
+    def follow(
+        self,
+        state: BodyFilterState,
+        frames: Iterable[Observed],
+        generator: torch.Generator | None,
+        first_frame: int,
+    ) -> tuple[BodyFilterState, BodyTrack]:
+        """Return the state after some frames, and the poses in them."""
+        return follow(self.filter, state, frames, self.cameras, generator, first_frame)
+
+
+def _masks(one: Observed) -> Tensor:
+    """Return the silhouettes of a frame that has them."""
+    if one.silhouettes is None:
+        raise InputError("expected silhouettes, got none")
+    return one.silhouettes
