@@ -17,6 +17,7 @@ from torchpose.priors._arms import ArmPrior
 from torchpose.priors._gaussian_mixture import LOG_2PI
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, sphere_points
+from torchpose.upper_body._torso_occlusion import log_in_view
 
 __all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity", "mirrored"]
 
@@ -38,7 +39,8 @@ class ArmInput(NamedTuple):
     """Measurements of both arms, the right one mirrored, in upright axes, given M hypotheses of the root.
 
     Attributes:
-        shoulder: metres, [B, 2, M, 3]. rays: the rays of elbow and hand, [B, 2, M, 2, 3].
+        shoulder: metres, [B, 2, M, 3]. middle: that of both shoulders, [B, 2, M, 3].
+        rays: the rays of elbow and hand, [B, 2, M, 2, 3].
         known: whether elbow and hand are measured, [B, 2, 2].
         patterns: the pairs of these that there are, for elbow and hand of any arm.
         variance: the variance across the rays of elbow and hand, metres squared, [B, 2, M, 2].
@@ -49,6 +51,7 @@ class ArmInput(NamedTuple):
     """
 
     shoulder: Tensor
+    middle: Tensor
     rays: Tensor
     known: Tensor
     patterns: Sequence[tuple[bool, bool]]
@@ -274,6 +277,11 @@ class ArmChain:
             weight = weight + log_beyond(
                 lower.ends, borders[..., :-1, :], borders[..., -1, :], log_inside[..., None, None]
             )
+        if elbow and hand:
+            places = torch.cat([upper.ends, lower.ends.flatten(-3, -2)], -2)
+            in_view = log_in_view(places, shoulder, meant(arm.middle))
+            of_elbow, of_hand = in_view.tensor_split(sizes[:1], -1)
+            weight = weight + of_elbow[..., None] + of_hand.view(weight.shape)
         weight = weight.flatten(-2)
         prior = self.density(directions, sizes[1])
         if weight.shape[-1] <= count:

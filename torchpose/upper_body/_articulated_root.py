@@ -127,6 +127,7 @@ class RootStep(NamedTuple):
         arm = _arm_input(frame, root, shoulders, lengths[:, 0], stiff)
         arm = arm._replace(
             shoulder=arm.shoulder.expand(-1, -1, count, -1),
+            middle=arm.middle.expand(-1, -1, count, -1),
             lengths=lengths[:, None, :, :2].expand(-1, 2, -1, -1),
         )
         return self._coarse(arm).log_evidence.sum(1)
@@ -164,16 +165,18 @@ def _arm_input(
     loose = (slack.square() + _SLACK**2)[:, None, None]
     axes = upright_axes(root.turn)
     limbs = frame.limbs[:, :, None].expand(-1, -1, shoulders.shape[2], -1, -1)
-    # the shoulder, then the rays of elbow and hand
-    places = torch.cat([shoulders[..., None, :], limbs], -2) @ axes.mT[:, None]
-    shoulder, rays = mirrored(places).split([1, 2], -2)
+    middle = shoulders.mean(1, keepdim=True).expand_as(shoulders)
+    # the shoulder and the middle of both, then the rays of elbow and hand
+    places = torch.cat([torch.stack([shoulders, middle], -2), limbs], -2) @ axes.mT[:, None]
+    joints, rays = mirrored(places).split([2, 2], -2)
+    shoulder, middle = joints.unbind(-2)
     bones = lengths[:, None, None, :2].expand(*shoulders.shape[:3], 2)
     borders = None
     if frame.borders is not None:
         turned = (frame.borders[:, None] @ axes.mT)[:, None].expand(-1, 2, -1, -1, -1)
         borders = mirrored(turned)
     return ArmInput(
-        shoulder[..., 0, :], rays, given.limbs, frame.facts.patterns,
+        shoulder, middle, rays, given.limbs, frame.facts.patterns,
         noise[:, :, None] * depth.square() + loose, axes, bones, borders, given.log_inside,
     )  # fmt: skip
 

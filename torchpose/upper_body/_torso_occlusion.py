@@ -1,0 +1,53 @@
+"""Weigh joints of arms that are measured although the person's own torso would hide them."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["log_in_view"]
+
+_WIDE, _DEEP = 0.45, 0.25  # half the width and depth of a torso, in widths of the shoulders
+_TOP, _BOTTOM = 0.15, 1.5  # where it begins and ends, below the shoulders, in the same
+_SOFT, _SOFT_TOP, _SOFT_BOTTOM = 0.15, 0.05, 0.1  # of its surface, in half depths; of its ends
+_FACING = 0.2  # sine of the turn about which a front becomes a back
+_HIDDEN = 0.1  # how often joints in a torso, or behind it, are measured, relative to those in view
+
+
+def log_in_view(
+    ends: Float[Tensor, "*batch N 3"],
+    shoulder: Float[Tensor, "*batch 3"],
+    middle: Float[Tensor, "*batch 3"],
+) -> Float[Tensor, "*batch N"]:
+    """Return the log of how often joints at these places are measured, relative to those in view.
+
+    The torso is an elliptic cylinder below the shoulders. With the place x of a joint and the direction c
+    of the camera relative to its axis, in its half-axes, the joint's ray meets the surface at s, if it does:
+
+        along = x . c,   s^2 = 1 - |x|^2 + along^2,   log (1 - (1 - h) P(hidden)),   h = 0.1
+
+    A joint is hidden if it is inside, |along| < s. From the front it is hidden behind the torso too,
+    along < s. From behind it is not taken to be: arms are in front of the torso most of the time, and
+    detectors guess them through it.
+
+    Args:
+        ends: places of elbows or hands, upright axes of the torso, from the camera, metres.
+        shoulder, middle: of the same arm, and the middle of both, in the same axes.
+    """
+    width = 2 * torch.linalg.vector_norm(shoulder - middle, dim=-1)[..., None, None]
+    off = (ends - middle[..., None, :]) / width
+    half = off.new_tensor([_WIDE, _DEEP])
+    flat, to_camera = off[..., ::2] / half, -middle[..., None, ::2] / half
+    to_camera = to_camera / torch.linalg.vector_norm(to_camera, dim=-1, keepdim=True)
+    along = (flat * to_camera).sum(-1)
+    beside = flat.square().sum(-1) - along.square()
+    surface = (1 - beside).clamp_min(1e-12).sqrt()
+    inside = torch.sigmoid((surface - along.abs()) / _SOFT)
+    behind = torch.sigmoid((surface - along) / _SOFT)
+    hidden = inside.lerp(behind, torch.sigmoid(-to_camera[..., 1] / _FACING))
+    down = off[..., 1]
+    at_height = torch.sigmoid((down - _TOP) / _SOFT_TOP) * torch.sigmoid(
+        (_BOTTOM - down) / _SOFT_BOTTOM
+    )
+    return torch.log1p((_HIDDEN - 1) * hidden * at_height * (beside < 1))
