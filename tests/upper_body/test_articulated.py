@@ -371,13 +371,20 @@ def test_smoothing_sums_over_all_later_paths():
     prior = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
     arms = [Arms(d[:, :, None], w.log()[:, :, None], p.log()[:, :, None])
             for d, w, p in zip(directions, said, prior, strict=True)]  # fmt: skip
-    states = [chain.start(arms[0])]
-    for arm in arms[1:]:
-        states.append(chain.update(states[-1], arm))
+    hands = torch.tensor([[[1, 1]], [[1, 0]], [[0, 0]], [[1, 1]]]).bool()  # measured or not
+    states = [chain.start(arms[0], hands[0])]
+    for arm, seen in zip(arms[1:], hands[1:], strict=True):
+        states.append(chain.update(states[-1], arm, seen))
 
     def moves(t):
-        walk = chain._walk(*directions[t - 1 : t + 1].flatten(1, 2))[None]
-        return (1 - chain.anew) * walk + chain.anew * prior[t, :, :, None]
+        pair = directions[t - 1 : t + 1].flatten(1, 2)
+        seen, unseen = (
+            (1 - anew) * chain._walk(*pair, step)[None] + anew * prior[t, :, :, None]
+            for step, anew in (
+                (chain.step, chain.anew), (chain.step_unseen, chain.anew_unseen)
+            )
+        )  # fmt: skip
+        return torch.where(hands[t, :, :, None, None], seen, unseen)
 
     def brute(first, last):
         """Return the weights of the hypotheses of frame `first`, given all frames up to `last`."""
@@ -394,6 +401,16 @@ def test_smoothing_sums_over_all_later_paths():
         for t in range(end + 1):
             last = end if lag is None else min(end, t + lag)
             torch.testing.assert_close(found[t].weight, brute(t, last))
+
+
+def test_a_hand_that_is_no_longer_measured_is_expected_where_it_was():
+    seen = pixels(body(1), 2.0).expand(50, -1, -1).clone()
+    hand = ROW["hand_left"]
+    true = seen[0, hand].clone()
+    seen[20:, hand] = torch.nan
+    found = tracker()(seen[None], names=UPPER_BODY).joints2d[0, :, hand]
+    away = (found - true).norm(dim=-1)
+    assert float(away[29]) < 10 and float(away[49]) < 15
 
 
 def test_smoothing_with_no_later_frame_is_filtering():

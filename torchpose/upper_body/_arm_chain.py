@@ -26,6 +26,7 @@ _AROUND = 150  # directions of one whose end is not
 _BOTH = 68  # of each of two such bones
 _STEP = math.radians(10.0)  # of a direction from frame to frame at 30 frames a second
 _ANEW = 0.2  # share of an arm's belief that is reinitialised in a frame at 30 frames a second
+_STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose hand is not measured
 _RATE = 30.0
 _NOTHING = -60.0
 _LEAST = 1e-30  # density
@@ -96,6 +97,7 @@ class ArmState(NamedTuple):
         log_evidence: the log-evidence of the frame given those before, [B, 2].
         prior, predicted: the density of the prior, and that predicted from the frames before, at each
             hypothesis, [B, 2, N].
+        seen: whether the hands are measured, [B, 2].
     """
 
     directions: Tensor
@@ -103,6 +105,7 @@ class ArmState(NamedTuple):
     log_evidence: Tensor
     prior: Tensor
     predicted: Tensor
+    seen: Tensor
 
 
 class DirectionDensity:
@@ -196,14 +199,19 @@ class ArmChain:
 
         p(x' | x) = (1 - e) t_4(x'; x, s^2) + e p(x')
 
+    An arm whose hand is not measured moves less (s = 5 degrees, e = 0.02 at 30 frames a second, else 10 and
+    0.2): what is not seen is best expected where it was.
+
     Args:
         density: the log-density of the prior over directions. fps: frames per second.
     """
 
     def __init__(self, density: DirectionDensity, fps: float) -> None:
         self.density = density
-        self.step = _STEP * math.sqrt(_RATE / fps)
-        self.anew = 1 - (1 - _ANEW) ** (_RATE / fps)
+        frames = _RATE / fps
+        self.step, self.step_unseen = _STEP * math.sqrt(frames), _STEP_UNSEEN * math.sqrt(frames)
+        self.anew = 1 - (1 - _ANEW) ** frames
+        self.anew_unseen = 1 - (1 - _ANEW_UNSEEN) ** frames
 
     def hypotheses(self, arm: ArmInput, angles: int = _ANGLES, around: int = _AROUND) -> Arms:
         """Return hypotheses that agree with the measurements of each arm, given each hypothesis of the root.
@@ -307,16 +315,26 @@ class ArmChain:
         tied = ((left @ self.density.together) * right).sum(-1)
         return arms.log_evidence.sum(1) + tied.log()
 
-    def start(self, arms: Arms) -> ArmState:
-        """Return the posterior after the first frame, given one hypothesis of the root."""
-        prior = arms.log_prior[:, :, 0].exp()
-        return _belief(arms, prior, prior)
+    def start(self, arms: Arms, seen: Bool[Tensor, "B 2"]) -> ArmState:
+        """Return the posterior after the first frame, given one hypothesis of the root.
 
-    def update(self, state: ArmState, arms: Arms) -> ArmState:
-        """Return the posterior after one more frame."""
+        Args:
+            arms: the hypotheses. seen: whether the hands are measured.
+        """
         prior = arms.log_prior[:, :, 0].exp()
-        moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0])
-        return _belief(arms, prior, (1 - self.anew) * moved + self.anew * prior)
+        return _belief(arms, prior, prior, seen)
+
+    def update(self, state: ArmState, arms: Arms, seen: Bool[Tensor, "B 2"]) -> ArmState:
+        """Return the posterior after one more frame; see `start`."""
+        prior = arms.log_prior[:, :, 0].exp()
+        moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0], seen)
+        predicted = moved + self._anew(seen, prior) * (prior - moved)
+        return _belief(arms, prior, predicted, seen)
+
+    def _anew(self, seen: Bool[Tensor, "B 2"], like: Tensor) -> Float[Tensor, "B 2 1"]:
+        """Return the share of each arm that is reinitialised in a frame."""
+        shares = like.new_tensor([self.anew_unseen, self.anew])
+        return shares[seen.long()][..., None]
 
     def smoothed(
         self, states: Sequence[ArmState], lengths: Tensor | None, lag: int | None
@@ -352,24 +370,43 @@ class ArmChain:
             after: the backward message at the next frame.
         """
         ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
-        moved = self._moved(ratio, later.directions, state.directions)
-        anew = (later.prior * ratio).sum(-1, keepdim=True)
-        message = (1 - self.anew) * moved + self.anew * anew
+        moved = self._moved(ratio, later.directions, state.directions, later.seen)
+        drawn = (later.prior * ratio).sum(-1, keepdim=True)
+        message = moved + self._anew(later.seen, moved) * (drawn - moved)
         return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
 
     def _moved(
-        self, weight: Float[Tensor, "B 2 N"], before: Tensor, after: Float[Tensor, "B 2 M 6"]
+        self,
+        weight: Float[Tensor, "B 2 N"],
+        before: Tensor,
+        after: Float[Tensor, "B 2 M 6"],
+        seen: Bool[Tensor, "B 2"],
     ) -> Float[Tensor, "B 2 M"]:
         """Return sum_n w_n t_4(x'_m; x_n, s^2) for the directions x of two frames."""
-        arms = (part.flatten(0, 1).split(_ARMS) for part in (weight[:, :, None], before, after))
-        moved = [torch.bmm(share, self._walk(*pair)) for share, *pair in zip(*arms, strict=True)]
+        if bool(seen.all()):
+            return self._walked(weight, before, after, self.step)
+        unseen = self._walked(weight, before, after, self.step_unseen)
+        if not bool(seen.any()):
+            return unseen
+        return torch.where(seen[..., None], self._walked(weight, before, after, self.step), unseen)
+
+    @classmethod
+    def _walked(
+        cls, weight: Float[Tensor, "B 2 N"], before: Tensor, after: Tensor, step: float
+    ) -> Float[Tensor, "B 2 M"]:
+        parts = (part.flatten(0, 1).split(_ARMS) for part in (weight[:, :, None], before, after))
+        moved = [
+            torch.bmm(share, cls._walk(old, new, step))
+            for share, old, new in zip(*parts, strict=True)
+        ]
         return torch.cat(moved).view(*after.shape[:-1])
 
+    @staticmethod
     def _walk(
-        self, before: Float[Tensor, "A N 6"], after: Float[Tensor, "A M 6"]
+        before: Float[Tensor, "A N 6"], after: Float[Tensor, "A M 6"], step: float
     ) -> Float[Tensor, "A N M"]:
         """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
-        scale = self.step**2
+        scale = step**2
         most = 6 / (16 * math.pi**2 * scale**2)
         unit = most**-0.25
         # of two pairs of unit vectors the product is 2 where they agree
@@ -403,11 +440,13 @@ def _by_bone(
     return upper.flatten(1).mT.contiguous(), lower.flatten(1).mT.contiguous()
 
 
-def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> ArmState:
+def _belief(
+    arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"], seen: Bool[Tensor, "B 2"]
+) -> ArmState:
     log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(_LEAST).log()
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
-    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted)
+    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen)
 
 
 def _rows_of(

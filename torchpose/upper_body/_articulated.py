@@ -281,8 +281,11 @@ class ArticulatedFilter(Estimator):
         shoulders = shoulder_places(tilted, root, middle, sizes.torso.width)
         # the arms, given the torso
         arms = self.root.arms(tilted, root, shoulders, sizes)
+        hands = tilted.given.limbs[..., 1]
         posterior = (
-            self.chain.start(arms) if state.arms is None else self.chain.update(state.arms, arms)
+            self.chain.start(arms, hands)
+            if state.arms is None
+            else self.chain.update(state.arms, arms, hands)
         )
         # the lengths of the bones, given both
         learnt = state.lengths
