@@ -132,11 +132,8 @@ def test_persons_come_and_go(prior):
 
 def test_windows_may_look_ahead_of_the_beliefs(prior):
     """Windows that have looked at all frames before the first belief give the same hands."""
-    tracker, faces, number = (
-        HandTracker(prior),
-        torch.tensor([(320.0, 120.0, 76.0)]),
-        torch.tensor([0]),
-    )
+    tracker, number = HandTracker(prior), torch.tensor([0])
+    faces = torch.tensor([(320.0, 120.0, 76.0)])
     frames = [scene(t) for t in range(12)]
     views, windows = [], tracker.init().windows
     for frame in frames:
@@ -315,10 +312,7 @@ def test_hands_are_not_born_before_the_face(prior):
     for cost in (0.0, 6.0):
         tracker = HandTracker(prior, HandSettings(face_rebirth=cost, jump=1.0, still=1.0))
         state, _ = tracker.step(tracker.init(), image, faces, torch.tensor([0]))
-        at = (
-            cell_centres().double() * state.windows.anchors[0, 2]
-            + state.windows.anchors[0, :2]
-            - faces[0, :2]
-        )
+        anchor = state.windows.anchors[0]
+        at = cell_centres().double() * anchor[2] + anchor[:2] - faces[0, :2]
         shares.append(float(state.beliefs.cells[0][:, at.norm(dim=-1) < 0.5 * 76].sum()))
     assert shares[1] < 0.02 * shares[0]

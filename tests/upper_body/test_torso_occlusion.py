@@ -62,9 +62,6 @@ def test_hands_before_the_chest_are_found_there():
         torchpose.load_prior("kinect-upper-body-small"), camera, fps=10.0, method="articulated"
     )
     found = tracker(seen[None], names=list(UPPER_BODY)).joints3d[0]
-    neck, hands = (
-        UPPER_BODY.index("neck"),
-        [UPPER_BODY.index(f"hand_{x}") for x in ("left", "right")],
-    )
+    neck, *hands = (UPPER_BODY.index(name) for name in ("neck", "hand_left", "hand_right"))
     off = (found - found[:, [neck]]) - (truth - truth[:, [neck]])
     assert float(off[:, hands].norm(dim=-1).mean()) < 0.095  # 0.11 where nothing is hidden

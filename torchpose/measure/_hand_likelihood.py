@@ -126,11 +126,7 @@ class HandLikelihood(nn.Module):
         to_elbow = elbow - places
         along = to_elbow / (to_elbow.square().sum(2, keepdim=True).sqrt_() + 1e-3)
         across = along.flip(2) * _ACROSS.to(along)
-        return self._shape_places(along / half, across / half, start)
-
-    def _shape_places(
-        self, along: Float[Tensor, "N 2 2 r c"], across: Float[Tensor, "N 2 2 r c"], start: Tensor
-    ) -> Float[Tensor, "N P 2 r c 2"]:
+        along, across = along / half, across / half
         offsets = self.shape_offsets.tolist()
         grid = along.new_empty(len(along), len(offsets), 2, *CELLS, 2)
         for point, (forward, aside) in enumerate(offsets):
