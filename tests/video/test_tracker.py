@@ -1,5 +1,6 @@
 """Persons of a video who leave, return and cross, rendered."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -121,6 +122,45 @@ def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one
         live += [found.pose.joints3d[0, 0] for found in people]
     whole = person.track.joints3d[0]
     torch.testing.assert_close(torch.stack(live[: len(whole)]), whole, rtol=1e-9, atol=1e-9)
+
+
+def test_what_tracking_leaves_behind_serves_gradients(prior, one_person):
+    from torchpose.measure._body_window import CELLS
+    from torchpose.measure._grid_filter import read_out
+    from torchpose.measure._hand_network import COARSE, HandNetwork
+
+    forget_constants()  # those that other tests have made
+    tracker, state = VideoTracker(prior, demo_camera(), method="mkf-fixed"), None
+    watched = []
+    for image in one_person[:8]:
+        state, people = tracker.step(state or tracker.init(), image)
+    tracker(one_person[:4], watch=lambda _, found, poses: watched.append((found, poses)))
+    scale = torch.ones((), dtype=torch.float64, requires_grad=True)
+    found, poses = watched[-1]
+    for value in (
+        people[0].pose.joints3d, people[0].pose.covariance2d, people[0].measured.size,
+        poses[0].joints2d, found.keypoints, found.hands.covariance, found.faces,
+    ):  # fmt: skip
+        (value.nan_to_num() * scale).square().sum().backward()
+    assert float(scale.grad) > 0
+    network = HandNetwork()
+    maps, colours = torch.rand(1, 4, *COARSE), torch.rand(1, 3, 4 * COARSE[0], 4 * COARSE[1])
+    network(colours, maps, torch.tensor([[0.0, 0.0, 1.0]])).square().sum().backward()
+    assert all(bool(weight.grad.isfinite().all()) for weight in network.parameters())
+    belief = torch.rand(1, 2, *CELLS, requires_grad=True)
+    read_out(belief, smooth=1.5, within=5.0).place.sum().backward()
+    assert float(belief.grad.norm()) > 0
+    leaf = people[0].measured.keypoints.clone()[None].requires_grad_()
+    tracker.tracker(leaf, names=tracker.measurer.names).joints3d.sum().backward()
+    assert float(leaf.grad.nan_to_num().norm()) > 0
+
+
+def forget_constants():
+    """Clear every cache of the package."""
+    for name in [name for name in sys.modules if name.startswith("torchpose.")]:
+        for value in vars(sys.modules[name]).values():
+            if hasattr(value, "cache_clear"):
+                value.cache_clear()
 
 
 def test_bad_use_is_refused(prior):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
+from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._skin import SkinModel
 
@@ -208,6 +209,7 @@ def inside_image(
 
 
 @lru_cache(maxsize=16)
+@outside_inference()
 def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) -> Tensor:
     """Return `inside_image` of flat anchors; cached, since windows mostly stay in place."""
     place, share = torch.tensor(anchors, dtype=torch.float64).view(-1, 3), []
@@ -221,6 +223,7 @@ def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) 
 
 
 @cache
+@outside_inference()
 def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
     """Return the places (x, y) of the cells (or of their finer pixels), in B from the anchor."""
     rows, columns = CELLS[0] * per_cell, CELLS[1] * per_cell
@@ -230,6 +233,7 @@ def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
 
 
 @cache
+@outside_inference()
 def cell_axes() -> tuple[Float[Tensor, " c"], Float[Tensor, " r"]]:
     """Return the places of the columns and rows of cells, in B from the anchor."""
     places = cell_centres()

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.module_state import outside_inference
+
 _LEAST = 1e-12  # belief in a cell: denormal numbers are slow
 
 __all__ = [
@@ -104,6 +106,7 @@ def _carry(belief: Float[Tensor, "N 2 h w"], flow: Float[Tensor, "N h w 2"]) -> 
 
 
 @cache
+@outside_inference()
 def _whole_grid(height: int, width: int) -> tuple[Tensor, Tensor]:
     """Return the places of all cells as `grid_sample` takes them, and how far apart these are [h, w, 2]."""
     x, y = (2 * torch.arange(n) + 1 for n in (width, height))
@@ -156,6 +159,7 @@ def _occupied(
 
 
 @cache
+@outside_inference()
 def _side_matrix(size: int, soft: float, hand: int) -> Tensor:
     """Return the matrix from columns of the other hand to how far each column is on its wrong side."""
     left_of = gaussian_matrix(size, soft) @ torch.ones(size, size).tril()
@@ -195,6 +199,7 @@ def _within_row(places: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 @cache
+@outside_inference()
 def _disc(radius: float) -> tuple[Float[Tensor, "3 d"], Bool[Tensor, "d d"]]:
     """Return 1, x and x squared of every cell of a row about the middle, and the cells within the radius."""
     reach = math.ceil(radius)
@@ -219,6 +224,7 @@ def gaussian_matrix(
 
 
 @cache
+@outside_inference()
 def _still_matrix(size: int, sigma: float) -> Tensor:
     """Return `gaussian_matrix` without a shift, cached."""
     return _gaussian(size, sigma, torch.zeros(1))
@@ -235,6 +241,7 @@ def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
 
 
 @cache
+@outside_inference()
 def _diagonals(size: int) -> tuple[Tensor, Tensor]:
     """Return how far each diagonal is from the middle one, and the diagonal of each entry, row by row."""
     place = torch.arange(size)

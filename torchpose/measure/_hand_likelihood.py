@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import check_finite, check_rgb, check_shape
 from torchpose._core.images import Image
+from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, cell_centres, halve
 from torchpose.measure._face import check_faces
@@ -140,6 +141,7 @@ class HandLikelihood(nn.Module):
 
 
 @cache
+@outside_inference()
 def _grid() -> tuple[Tensor, Tensor, Tensor]:
     """Return the places of the cells [2, r, c], in B and in halves of the window from its middle, and these.
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
+from torchpose._core.module_state import outside_inference
 from torchpose._core.network_file import read_network, write_network
 from torchpose._core.tensor_file import FileKind
 from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
@@ -275,6 +276,7 @@ def _where(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 r c"]:
 
 
 @cache
+@outside_inference()
 def _coarse_centres() -> Float[Tensor, "1 2 r c"]:
     """Return the places (x, y) of the coarse cells, in B from the anchor."""
     return avg_pool2d(cell_centres().movedim(-1, 0)[None], 2)

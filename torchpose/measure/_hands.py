@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from torchpose._core.images import Image
+from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._background import Motion
 from torchpose.measure._body_window import (
@@ -375,6 +376,7 @@ def _hands_near(belief: Tensor) -> Tensor:
 
 
 @cache
+@outside_inference()
 def _band(size: int) -> Tensor:
     place = torch.arange(size)
     return ((place[:, None] - place).abs() <= _NEAR).float()

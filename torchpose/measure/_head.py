@@ -8,6 +8,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_shape
+from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, COLOURS, EVIDENCE, cell_centres, faces_in_window
 
@@ -249,6 +250,7 @@ class FaceMemory(nn.Module):
 
 
 @cache
+@outside_inference()
 def head_mask() -> Float[Tensor, "104 72"]:
     """Return a map over the patch that is one on head and neck and zero elsewhere, with soft edges."""
     x, y = _patch_places().unbind(-1)
@@ -270,6 +272,7 @@ def _box(size: int, width: int) -> Tensor:
 
 
 @cache
+@outside_inference()
 def _patch_places() -> Tensor:
     x = (torch.arange(_COLUMNS) + 0.5) * (2 * _HALF_WIDTH / _COLUMNS) - _HALF_WIDTH
     y = (torch.arange(_ROWS) + 0.5) * (_HEIGHT / _ROWS) + _TOP
@@ -294,6 +297,7 @@ def _pairs(x: Float[Tensor, "N w"], y: Float[Tensor, "N h"]) -> Float[Tensor, "N
 
 
 @cache
+@outside_inference()
 def _part_grid() -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """Return the columns and rows of the patch in halves of `head_part`, its middle, and these halves."""
     part = cell_centres()[_PART_ROWS, _PART_COLUMNS]
@@ -329,6 +333,7 @@ def _best_shift(model: Tensor, inner: Tensor) -> Tensor:
 
 
 @cache
+@outside_inference()
 def _every_second(size: int) -> Tensor:
     """Return the matrix of means over `size` places, every second one, from each shift."""
     shift = torch.arange(2 * _SEARCH + 1)[:, None]
@@ -345,6 +350,7 @@ def _to_window(patch: Tensor, at: Tensor) -> Tensor:
 
 
 @cache
+@outside_inference()
 def _window_grid() -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """Return the columns and rows of `head_part` in halves of the patch, its middle, and these halves."""
     half = torch.tensor([_HALF_WIDTH, _HEIGHT / 2])

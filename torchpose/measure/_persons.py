@@ -15,6 +15,7 @@ __all__ = [
     "PersonRegister",
     "Persons",
     "clothes_colours",
+    "map_tensors",
     "match_rows",
     "match_states",
     "measure_by_scale",
@@ -60,13 +61,13 @@ def match_states(state: State, fresh: State, identity: Int[Tensor, " N"]) -> Sta
     known: Any = state
     identity = identity.to(known.identity)
     rows = match_rows(known.identity, identity)
-    matched: Any = _map(lambda old, new: torch.cat([old, new])[rows], state, fresh)
+    matched: Any = map_tensors(lambda old, new: torch.cat([old, new])[rows], state, fresh)
     return matched._replace(identity=identity.clone())  # type: ignore[no-any-return]
 
 
 def take_rows(state: State, rows: slice | Tensor) -> State:
     """Return some persons of a state; every tensor has the persons as its first dimension."""
-    return _map(lambda tensor: tensor[rows], state)
+    return map_tensors(lambda tensor: tensor[rows], state)
 
 
 def measure_by_scale(scales: Tensor, measure: Callable[[float, Int[Tensor, " n"]], State]) -> State:
@@ -82,14 +83,14 @@ def measure_by_scale(scales: Tensor, measure: Callable[[float, Int[Tensor, " n"]
         rows, values = [group], scales.new_ones(1)
     found = [measure(value, own) for value, own in zip(values.tolist(), rows, strict=True)]
     order = torch.cat(rows).argsort()
-    return _map(lambda *parts: torch.cat(parts)[order], *found)
+    return map_tensors(lambda *parts: torch.cat(parts)[order], *found)
 
 
-def _map(function: Callable[..., Tensor], *states: Any) -> Any:
-    """Return the state whose tensors are those of a function of the states' tensors."""
+def map_tensors(function: Callable[..., Tensor], *states: Any) -> Any:
+    """Return the state whose tensors are those of a function of the tensors of states of one kind."""
     if isinstance(states[0], Tensor):
         return function(*states)
-    fields = (_map(function, *values) for values in zip(*states, strict=True))
+    fields = (map_tensors(function, *values) for values in zip(*states, strict=True))
     return type(states[0])(*fields)
 
 

