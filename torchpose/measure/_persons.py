@@ -15,7 +15,6 @@ __all__ = [
     "PersonRegister",
     "Persons",
     "clothes_colours",
-    "map_tensors",
     "match_rows",
     "match_states",
     "measure_by_scale",
@@ -61,13 +60,13 @@ def match_states(state: State, fresh: State, identity: Int[Tensor, " N"]) -> Sta
     known: Any = state
     identity = identity.to(known.identity)
     rows = match_rows(known.identity, identity)
-    matched: Any = map_tensors(lambda old, new: torch.cat([old, new])[rows], state, fresh)
+    matched: Any = _map(lambda old, new: torch.cat([old, new])[rows], state, fresh)
     return matched._replace(identity=identity.clone())  # type: ignore[no-any-return]
 
 
 def take_rows(state: State, rows: slice | Tensor) -> State:
     """Return some persons of a state; every tensor has the persons as its first dimension."""
-    return map_tensors(lambda tensor: tensor[rows], state)
+    return _map(lambda tensor: tensor[rows], state)
 
 
 def measure_by_scale(scales: Tensor, measure: Callable[[float, Int[Tensor, " n"]], State]) -> State:
@@ -83,14 +82,14 @@ def measure_by_scale(scales: Tensor, measure: Callable[[float, Int[Tensor, " n"]
         rows, values = [group], scales.new_ones(1)
     found = [measure(value, own) for value, own in zip(values.tolist(), rows, strict=True)]
     order = torch.cat(rows).argsort()
-    return map_tensors(lambda *parts: torch.cat(parts)[order], *found)
+    return _map(lambda *parts: torch.cat(parts)[order], *found)
 
 
-def map_tensors(function: Callable[..., Tensor], *states: Any) -> Any:
-    """Return the state whose tensors are those of a function of the tensors of states of one kind."""
+def _map(function: Callable[..., Tensor], *states: Any) -> Any:
+    """Return the state whose tensors are those of a function of the states' tensors."""
     if isinstance(states[0], Tensor):
         return function(*states)
-    fields = (map_tensors(function, *values) for values in zip(*states, strict=True))
+    fields = (_map(function, *values) for values in zip(*states, strict=True))
     return type(states[0])(*fields)
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from torchpose._core.inference import in_inference_mode
 from torchpose.camera._choice import resolve_camera
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import DegenerateFilterWarning, InputError
@@ -235,6 +236,7 @@ class KeypointFileTracker:
         notes += tuple(keypoints.notes) + more
         return PreparedTracker(self._tracker(key, camera), camera, names, notes)
 
+    @in_inference_mode
     def track(
         self, keypoints: Keypoints, prepared: PreparedTracker | None = None, progress: bool = False
     ) -> PoseTrack:
@@ -249,7 +251,7 @@ class KeypointFileTracker:
         """
         tracker, _, names, notes = prepared or self.prepare(keypoints)
         confidence = keypoints.confidence
-        with warnings.catch_warnings(), torch.no_grad():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore", DegenerateFilterWarning)
             track = tracker(
                 keypoints.keypoints[None],

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 
 from torchpose._core.images import Image
+from torchpose._core.inference import usable_anywhere
 from torchpose.errors import InputError
 from torchpose.measure._keypoint_measurer import FrameKeypoints, KeypointMeasurer, KeypointState
-from torchpose.measure._persons import map_tensors
 from torchpose.measure._upper_body_measurer import (
     Candidates,
     FrameMeasurements,
@@ -95,8 +95,8 @@ def measurer_of(own: UpperBodyMeasurer | KeypointMeasurer) -> Measurer:
 class FaceStage(NamedTuple):
     """Measures by faces and hands; `UpperBodyMeasurer` as a `Measurer`.
 
-    Both stages run in inference mode, in which small operations take a sixth less time. The states keep
-    tensors of that mode, which gradients cannot pass; measurements do not.
+    Both stages run in inference mode, in which small operations take a sixth less time than without
+    gradients alone. Only the states keep tensors of it, which gradients cannot pass.
     """
 
     own: UpperBodyMeasurer
@@ -122,7 +122,6 @@ class FaceStage(NamedTuple):
             raise InputError("expected what was seen in the frames before, got None")
         return SeenFrame(image, self.own.look(seen, image))
 
-    @torch.no_grad()
     def step(
         self,
         state: MeasurerState,
@@ -133,7 +132,7 @@ class FaceStage(NamedTuple):
         _check_state(state, MeasurerState)
         with torch.inference_mode():
             state, found = self.own.step(state, frame.image, frame.view, candidates)
-        return state, map_tensors(torch.clone, found)
+        return state, usable_anywhere(found)
 
 
 class DetectorStage(NamedTuple):

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.images import Image
+from torchpose._core.inference import usable_anywhere
 from torchpose.errors import InputError
 from torchpose.measure._association import AssociationState, HandAssociation
 from torchpose.measure._keypoint_measurer import FrameKeypoints
@@ -160,14 +161,12 @@ class PersonStream(nn.Module):
         votes = None if self.association is None else self.association.init()
         return PersonStreamState(stream, votes)
 
-    @torch.no_grad()
     def advance(
         self, state: PersonStreamState, measured: Measured, images: Sequence[Image] = ()
     ) -> tuple[PersonStreamState, PoseTrack, Measured]:
         """Return the poses of the next frames.
 
-        They are computed in inference mode, in which small operations take a sixth less time; only the
-        state keeps tensors of it, which gradients cannot pass.
+        They are computed in inference mode. Only the state keeps tensors of it, which gradients cannot pass.
 
         Args:
             state: the state from `init` or the previous call. measured: the measurements in these frames.
@@ -178,9 +177,7 @@ class PersonStream(nn.Module):
             were swapped.
         """
         state, poses, chosen = self._advance(state, measured, images)
-        fields = (*FRAME_FIELDS, "lengths", "failed_at", "matrix")
-        poses = replace(poses, **{name: getattr(poses, name).clone() for name in fields})
-        return state, poses, Measured(*(None if x is None else x.clone() for x in chosen))  # type: ignore[arg-type]
+        return state, usable_anywhere(poses), usable_anywhere(chosen)
 
     @torch.inference_mode()
     def _advance(
