@@ -1,6 +1,6 @@
 """Run `python -m train`: fit, select, predict."""
 
-from train.cli import main
+from train.cli import end_process, main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    end_process(main())

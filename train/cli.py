@@ -4,8 +4,9 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
-__all__ = ["main"]
+__all__ = ["end_process", "main"]
 
 _HELP = """\
 usage: python -m train COMMAND ...
@@ -45,6 +46,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command in ("fit", "select"):
         return _fit(arguments)
     return _refuse(f"unknown command {command!r}; known are fit, select and predict")
+
+
+def end_process(status: int) -> NoReturn:
+    """End this process with an exit code, without Python's own clearing up if it is one of several.
+
+    Threads of gloo may still hold tensors of the last exchange. To free them they need Python's lock:
+    Python waits for these threads while it holds the lock, or aborts them (SIGABRT) once it is half gone.
+
+    Args:
+        status: the exit code.
+    """
+    distributed = sys.modules.get("torch.distributed")
+    if distributed is not None and distributed.is_available() and distributed.is_initialized():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def _fit(arguments: list[str]) -> int:

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 pytest.importorskip("tensorboard", reason="training needs the extra `train`")
@@ -17,7 +18,7 @@ from tests.train.forked import ForkedFit
 from tests.train.people import settings, write_recordings, write_settings
 from tests.train.test_fit import assert_same
 from torchpose.priors import load_prior
-from train.cli import main
+from train.cli import end_process, main
 
 ROOT = Path(__file__).parents[2]
 LOCAL = {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "GLOO_SOCKET_IFNAME": "lo"}
@@ -94,6 +95,17 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
     assert {p.name for p in tmp_path.iterdir()} <= {"fit.yaml", "runs"}
     for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
         assert signal.signal(number, handler) in (handler, signal.SIG_IGN)
+
+
+@pytest.mark.parametrize("grouped", [True, False])
+def test_only_a_process_of_several_ends_without_clearing_up(monkeypatch, grouped):
+    ended = []
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: grouped)
+    monkeypatch.setattr(os, "_exit", ended.append)
+    with pytest.raises(SystemExit) as stopped:
+        end_process(3)
+    assert ended == [3] * grouped
+    assert stopped.value.code == 3
 
 
 def node(port):
