@@ -18,16 +18,18 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.body._kinematics import Body
+from torchpose.body._limbs import level_plan
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.math._rotations import (
+    cross_matrix,
+    exponential,
     matrix_to_quaternion_vector,
     minimal_rotation,
     quaternion_vector_to_matrix,
-    rotvec_to_matrix,
 )
 
 __all__ = ["Articulation", "BodyPoint", "JointJacobian"]
@@ -88,11 +90,13 @@ class Articulation(nn.Module):
     part_of: Tensor
     axis_part: Tensor
     axis: Tensor
+    generators: Tensor
     pivot: Tensor
     moves: Tensor
     centres: Tensor
     carriers: Tensor
     in_group: Tensor
+    _order: Tensor
 
     def __init__(
         self,
@@ -124,10 +128,13 @@ class Articulation(nn.Module):
             "part_of": parts,
             "axis_part": torch.tensor([p for p, _ in axes]),
             "axis": torch.tensor([a for _, a in axes]),
+            "generators": _generators(axes, len(skeleton.parts)),
             "pivot": torch.tensor([_pivot(skeleton, p) for p, _ in axes]),
             "moves": moved[[p for p, _ in axes]].double(),
             "centres": _centre_rotations(skeleton),
         }
+        plan = {**level_plan(skeleton), **self._limb_plan()}
+        buffers |= {name: torch.tensor(index, dtype=torch.long) for name, index in plan.items()}
         for name, value in buffers.items():
             value = value.to(dtype) if value.is_floating_point() else value
             self.register_buffer(name, value, persistent=False)
@@ -168,6 +175,18 @@ class Articulation(nn.Module):
         logs = (lengths[..., 1:] / self.offsets[1:].norm(dim=-1)).log()
         members = self.in_group[1:]
         return (logs @ members) / members.sum(0)
+
+    def _limb_plan(self) -> dict[str, list[int]]:
+        """Return per level its limbs, their places in the level, and both joints of their bones."""
+        plan, skeleton = {}, self.skeleton
+        for depth, level in enumerate(skeleton.part_levels):
+            limbs = [part for part in level if part in self.limb_parts]
+            ends = [skeleton.part_of.index(part) for part in limbs]
+            plan[f"_limbs_{depth}"] = limbs
+            plan[f"_in_level_{depth}"] = [level.index(part) for part in limbs]
+            plan[f"_ends_{depth}"] = ends
+            plan[f"_starts_{depth}"] = [skeleton.parents[end] for end in ends]
+        return plan
 
     def _carriers(self) -> Float[Tensor, "J N"]:
         """Return which columns directly move a joint: angles and shift of its bone, and their velocity."""
@@ -228,42 +247,48 @@ class Articulation(nn.Module):
         """
         if known is not None:
             joints = torch.where(known[..., None], joints, self.joints(point))
-        rotations = point.rotations.clone()
-        for level in self.skeleton.part_levels[1:]:
-            limbs = [part for part in level if part in self.limb_parts]
-            if not limbs:
-                continue
-            ends = [self.skeleton.part_of.index(part) for part in limbs]
-            bones = joints[:, ends] - joints[:, [self.skeleton.parents[end] for end in ends]]
-            world = self.world_rotations(point._replace(rotations=rotations))
-            above = world[:, [self.skeleton.part_parents[part] for part in limbs]]
-            seen = ((above @ self.centres[limbs]).mT @ bones[..., None]).squeeze(-1)
-            swing = quaternion_vector_to_matrix(
-                minimal_rotation(self.offsets[ends].expand_as(seen), seen)
+        rotations = point.rotations
+        world = self.centres[:1] @ rotations[:, :1]
+        for depth in range(1, len(self.skeleton.part_levels)):
+            parts, above = self._level(depth, "parts"), self._level(depth, "above")
+            frames = world.index_select(1, above) @ self.centres[parts]
+            turns = rotations.index_select(1, parts)
+            limbs, places, ends, starts = (
+                self._level(depth, name) for name in ("limbs", "in_level", "ends", "starts")
             )
-            if known is not None:
-                swing = torch.where(known[:, ends, None, None], swing, rotations[:, limbs])
-            rotations[:, limbs] = swing
+            if len(limbs):
+                bones = joints.index_select(1, ends) - joints.index_select(1, starts)
+                seen = (frames.index_select(1, places).mT @ bones[..., None]).squeeze(-1)
+                swing = quaternion_vector_to_matrix(
+                    minimal_rotation(self.offsets[ends].expand_as(seen), seen)
+                )
+                if known is not None:
+                    before = turns.index_select(1, places)
+                    swing = torch.where(known[:, ends, None, None], swing, before)
+                turns = turns.index_copy(1, places, swing)
+                rotations = rotations.index_copy(1, limbs, swing)
+            world = frames @ turns
         return point._replace(rotations=rotations)
+
+    def _level(self, depth: int, name: str) -> Int[Tensor, " N"]:
+        """Return indices of a level of parts; see `level_plan` and `_limb_plan`."""
+        return self.get_buffer(f"_{name}_{depth}")
 
     def _turns(self, angles: Tensor) -> Tensor:
         """Return rotation matrices [..., P, 3, 3] of the parts' turns by angles [..., R]."""
-        vectors = angles.new_zeros(*angles.shape[:-1], len(self.skeleton.parts), 3)
-        vectors[..., self.axis_part, self.axis] = angles
-        return rotvec_to_matrix(vectors)
+        skew = angles @ self.generators
+        return exponential(skew.unflatten(-1, (-1, 3, 3)))
 
     # --- joints -----------------------------------------------------------------------------------
 
     def world_rotations(self, point: BodyPoint) -> Float[Tensor, "*batch P 3 3"]:
         """Return the rotation of every part, from part axes to world axes."""
         turns = self.centres @ point.rotations
-        levels, order = [turns[..., :1, :, :]], [0]
-        for level in self.skeleton.part_levels[1:]:
-            above = [order.index(self.skeleton.part_parents[p]) for p in level]
-            levels.append(torch.cat(levels, -3)[..., above, :, :] @ turns[..., list(level), :, :])
-            order += level
-        back = sorted(range(len(order)), key=order.__getitem__)
-        return torch.cat(levels, -3)[..., back, :, :]
+        world = [turns[..., :1, :, :]]
+        for depth in range(1, len(self.skeleton.part_levels)):
+            parts, above = self._level(depth, "parts"), self._level(depth, "above")
+            world.append(world[-1].index_select(-3, above) @ turns.index_select(-3, parts))
+        return torch.cat(world, -3).index_select(-3, self._order)
 
     def bones(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the bones from each joint's parent to it in the axes of the part that carries it."""
@@ -328,6 +353,14 @@ def _paths(parents: Sequence[int]) -> Tensor:
             path[above, node] = True
             above = parents[above]
     return path
+
+
+def _generators(axes: Sequence[tuple[int, int]], n_parts: int) -> Float[Tensor, "R P9"]:
+    """Return the cross matrices of all parts, for a unit turn of a part about an axis of its own each."""
+    generators = torch.zeros(len(axes), n_parts, 3, 3, dtype=torch.float64)
+    for row, (part, axis) in enumerate(axes):
+        generators[row, part] = cross_matrix(torch.eye(3, dtype=torch.float64)[axis])
+    return generators.flatten(1)
 
 
 def _pivot(skeleton: BodySkeleton, part: int) -> int:

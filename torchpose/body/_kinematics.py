@@ -169,12 +169,17 @@ class Body(nn.Module):
         weights = point_weights(skeleton, offsets, self.tips.double())
         at = {name: i for i, name in enumerate(skeleton.points)}
         ends = [at[e] for limb in skeleton.limbs for e in (limb.start, limb.end)]
+        centred = self.centres.requires_grad or bool(self.centres.any())
+        turns = torch.eye(3, dtype=torch.float64, device=offsets.device)
+        turns = turns.repeat(len(skeleton.parts), 1, 1)
+        if centred:
+            turns = quaternion_vector_to_matrix(self.centres.double())
         return _Geometry(
             offsets.to(dtype),
-            quaternion_vector_to_matrix(self.centres.double()).to(dtype),
+            turns.to(dtype),
             weights[:, : len(skeleton.names)].contiguous().to(dtype),
             weights[:, ends].to(dtype),
-            bool(self.centres.any()),
+            centred,
         )
 
     @classmethod

@@ -1,5 +1,6 @@
 """Describe the limbs of a body, and check the parameters that a body is built from."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.module_state import outside_inference
 from torchpose.body._skeleton import BodySkeleton
 from torchpose.errors import InputError, ShapeError
 
@@ -134,16 +136,24 @@ def checked_radii(skeleton: BodySkeleton, radii: Tensor) -> Tensor:
 
 def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tensor:
     """Return the linear map [3 P, J + K] from the columns of the parts' rotations to all points."""
-    n_points = len(skeleton.points)
-    weights = offsets.new_zeros(len(skeleton.parts), 3, n_points)
-    for level in skeleton.joint_levels[1:]:  # a joint moves with all that moves its parent
-        for joint in level:
-            weights[..., joint] = weights[..., skeleton.parents[joint]]
-            weights[skeleton.part_of[joint], :, joint] += offsets[joint]
-    for k, tip in enumerate(skeleton.tips, start=len(skeleton.names)):
-        weights[..., k] = weights[..., skeleton.joint(tip.joint)]
-        weights[skeleton.part(tip.part), :, k] += tips[k - len(skeleton.names)]
+    carried = _carried(skeleton).to(offsets)
+    weights = torch.einsum("pij,ia->paj", carried, torch.cat([offsets, tips]))
     return weights.flatten(0, 1)
+
+
+@lru_cache(maxsize=16)
+def _carried(skeleton: BodySkeleton) -> Float[Tensor, "P N N"]:
+    """Return whether a part turns the offset of a point on the way from the root to another, N = J + K."""
+    n_joints, n_points = len(skeleton.names), len(skeleton.points)
+    parents = [*skeleton.parents, *(skeleton.joint(tip.joint) for tip in skeleton.tips)]
+    parts = [*skeleton.part_of, *(skeleton.part(tip.part) for tip in skeleton.tips)]
+    with outside_inference():
+        carried = torch.zeros(len(skeleton.parts), n_points, n_points, dtype=torch.float64)
+        joints = [joint for level in skeleton.joint_levels[1:] for joint in level]
+        for point in (*joints, *range(n_joints, n_points)):  # moves with all that moves its parent
+            carried[..., point] = carried[..., parents[point]]
+            carried[parts[point], point, point] = 1
+        return carried
 
 
 def check_limb_lengths(skeleton: BodySkeleton, limb_weights: Tensor) -> None:

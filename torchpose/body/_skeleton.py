@@ -5,6 +5,7 @@ standing, arms hanging), z forward; x cross y = z. Left and right are the person
 `BodySkeleton` are fractions of the body height, so that one skeleton serves every person.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -226,15 +227,17 @@ class BodySkeleton:
         Raises:
             InputError: no bone length is finite.
         """
-        share = torch.tensor(self.proportions, dtype=torch.float64)
-        lengths = bone_lengths.detach().to("cpu", torch.float64)
-        legs = (share > _LEG_BONE) & torch.tensor(
-            [self.single_joint(part) == joint for joint, part in enumerate(self.part_of)]
-        )
-        for wanted in (legs, share > 0):
-            known = wanted & torch.isfinite(lengths)
-            if bool(known.any()):
-                return float(lengths[known].sum() / share[known].sum())
+        lengths = bone_lengths.detach().tolist()
+        bones = [*zip(self.proportions, lengths, strict=True)]
+        legs = [
+            bone for joint, bone in enumerate(bones)
+            if bone[0] > _LEG_BONE and self.single_joint(self.part_of[joint]) == joint
+        ]  # fmt: skip
+        for wanted in (legs, bones):
+            known = [bone for bone in wanted if bone[0] > 0 and math.isfinite(bone[1])]
+            if known:
+                shares, metres = zip(*known, strict=True)
+                return float(sum(metres) / sum(shares))
         raise InputError("the body height needs at least one bone length, got none that is finite")
 
 

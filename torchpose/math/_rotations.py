@@ -25,6 +25,7 @@ __all__ = [
     "conjugate",
     "cross_matrix",
     "euler_to_matrix",
+    "exponential",
     "matrix_to_euler",
     "matrix_to_quaternion_vector",
     "mean_rotation",
@@ -150,16 +151,18 @@ def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
     R = I + (sin a / a) [v]x + ((1 - cos a) / a^2) [v]x^2,   a = |v|, by series near zero.
     """
     check_shape("rotvec", rotvec, ["...", 3])
-    x, y, z = rotvec.unbind(-1)
-    o = torch.zeros_like(x)
-    skew = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
-    squared = rotvec.square().sum(-1)[..., None, None]
+    return exponential(cross_matrix(rotvec))
+
+
+def exponential(skew: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation matrix exp [v]x of a cross matrix; see `rotvec_to_matrix`."""
+    squared = (skew.square().sum((-2, -1)) / 2)[..., None, None]
     near_zero = squared < 1e-8  # the next terms of the series are below the rounding of float64
-    angle = torch.where(near_zero, torch.ones_like(squared), squared).sqrt()
+    angle = torch.where(near_zero, 1.0, squared).sqrt()
     first = torch.where(near_zero, 1 - squared / 6, angle.sin() / angle)
     half = (angle / 2).sin() / angle
     second = torch.where(near_zero, 0.5 - squared / 24, 2 * half.square())
-    eye = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    eye = torch.eye(3, dtype=skew.dtype, device=skew.device)
     return eye + first * skew + second * (skew @ skew)
 
 

@@ -337,6 +337,13 @@ def test_bad_input_is_refused(four, change, error, words):
 def test_keypoints_of_another_image_size_are_refused(four):
     with pytest.raises(CameraError, match="scaled"):
         tracker(four.rig)(keypoints=4 * four.keypoints)
+    third = four.keypoints.clone()
+    third[:, 2] *= 4
+    with pytest.raises(CameraError, match=four.rig.names[2]):
+        tracker(four.rig)(keypoints=third)
+    few = third.clone()
+    few[:, 2, :8] = four.keypoints[:, 2, :8]
+    assert len(tracker(four.rig)(keypoints=few)) == len(few)
 
 
 def test_cameras_in_millimetres_are_refused():

@@ -16,6 +16,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     RigMaps,
     exchange_of,
     information,
+    readings_of,
     see,
     weigh,
 )
@@ -109,7 +110,8 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     seen = see(maps, joints)
     spread = jacobian @ cov[:, None] @ jacobian.mT
     exchange = exchange_of(BODY_15)
-    weighed = weigh(frame, seen, maps, state.beliefs, exchange, spread, marginal=True)
+    readings = readings_of(frame, exchange)
+    weighed = weigh(readings, seen, maps, state.beliefs, exchange, spread, marginal=True)
     H = torch.einsum("bcjik,bjkn->bcjin", seen.by_joint, jacobian).reshape(-1, body.dim)
     weight = (weighed.own / weighed.variance)[..., None].expand(-1, -1, -1, 2).reshape(-1)
     residual = (frame.pixels - seen.pixels).reshape(-1)
@@ -119,7 +121,7 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     torch.testing.assert_close(found.state.cov[0], dense, rtol=1e-5, atol=1e-9)
     moved = body.joints(body.moved(point, step[None]))
     torch.testing.assert_close(found.joints, moved, rtol=0, atol=1e-6)
-    W, _ = information(frame, seen, weighed, exchange)
+    W, _ = information(readings, seen, weighed)
     assert (torch.linalg.eigvalsh(W) >= -1e-6).all()
 
 

@@ -34,6 +34,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Weighed,
     exchange_of,
     information,
+    readings_of,
     see,
     squared_errors,
     weigh,
@@ -204,12 +205,13 @@ class BodyKalmanFilter(nn.Module):
             widths: factor of the noise's variance in every iteration, for a start far from the solution;
                 by default 1, and more only where a joint has jumped.
         """
+        readings = readings_of(frame, self.exchange)
         if widths is not None:
-            return self._iterated(state, frame, widths)
-        found = self._linearised(state, state.mean, frame)
-        doubt, jumped = self._doubts(state, frame, found)
+            return self._iterated(state, readings, widths)
+        found = self._linearised(state, state.mean, readings)
+        doubt, jumped = self._doubts(state, readings, found)
         state = state._replace(doubt=doubt)
-        corrected = self._iterated(state, frame, (1.0,) * self.n_iterations, found)
+        corrected = self._iterated(state, readings, (1.0,) * self.n_iterations, found)
         rows = jumped.any(-1).nonzero().squeeze(-1)
         return self._recovered(corrected, state, frame, jumped, rows) if len(rows) else corrected
 
@@ -228,17 +230,18 @@ class BodyKalmanFilter(nn.Module):
         """
         widened = (jumped[rows].to(state.cov) @ self.articulation.carriers) * self._jump_variance
         wide = state.take(rows)
-        joints = triangulate(self.maps, frame.take(rows))
+        frame = frame.take(rows)
+        joints = triangulate(self.maps, frame)
         seen = jumped[rows] & joints.isfinite().all(-1)
         mean = self.articulation.swung(wide.mean, joints.nan_to_num(), seen)
         wide = wide._replace(mean=mean, cov=wide.cov + torch.diag_embed(widened))
-        again = self._iterated(wide, frame.take(rows), _RECOVERY)
+        again = self._iterated(wide, readings_of(frame, self.exchange), _RECOVERY)
         return corrected.put(rows, again._replace(widened=widened))
 
     def _iterated(
         self,
         state: BodyGaussian,
-        frame: KeypointFrame,
+        readings: KeypointFrame,
         widths: Sequence[float],
         found: _Linearised | None = None,
     ) -> CorrectedBody:
@@ -247,20 +250,20 @@ class BodyKalmanFilter(nn.Module):
         joint_cov: Tensor | None = None
         for width in widths:
             if found is None:
-                found = self._linearised(state, point, frame, joint_cov, width)
-            step = self._step(frame, found, d)
+                found = self._linearised(state, point, readings, joint_cov, width)
+            step = self._step(readings, found, d)
             d = step.step
             point = self.articulation.moved(state.mean, d)
             UH = step.U @ found.H.mT
             joint_cov, G, found = _blocks(found.G - UH.mT @ UH), found.G, None
         assert joint_cov is not None  # there is a step at least
-        return self._corrected(state, frame, point, joint_cov, step, G)
+        return self._corrected(state, readings, point, joint_cov, step, G)
 
     def _linearised(
         self,
         state: BodyGaussian,
         point: BodyPoint,
-        frame: KeypointFrame,
+        readings: KeypointFrame,
         joint_cov: Tensor | None = None,
         width: float = 1.0,
     ) -> _Linearised:
@@ -271,16 +274,16 @@ class BodyKalmanFilter(nn.Module):
         G = HP @ H.mT
         seen = see(self.maps, joints)
         weighed = weigh(
-            frame, seen, self.maps, state.beliefs, self.exchange,
+            readings, seen, self.maps, state.beliefs, self.exchange,
             _blocks(G) if joint_cov is None else joint_cov,
             marginal=joint_cov is None, decide=width < _DECIDED, width=width,
         )  # fmt: skip
         return _Linearised(H, HP, G, seen, weighed)
 
-    def _step(self, frame: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]) -> _Step:
+    def _step(self, readings: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]) -> _Step:
         """Return one step of Gauss and Newton from the prediction."""
         H, HP, G, seen, weighed = found
-        W, b = information(frame, seen, weighed, self.exchange)
+        W, b = information(readings, seen, weighed)
         L = _factors(W)
         LHP = (L.mT @ HP.unflatten(-2, (-1, 3))).flatten(-3, -2)
         LGL = ((LHP @ H.mT).unflatten(-1, (-1, 3)).transpose(-3, -2) @ L).transpose(-3, -2)
@@ -296,7 +299,7 @@ class BodyKalmanFilter(nn.Module):
     def _corrected(
         self,
         state: BodyGaussian,
-        frame: KeypointFrame,
+        readings: KeypointFrame,
         point: BodyPoint,
         joint_cov: Tensor,
         step: _Step,
@@ -306,14 +309,14 @@ class BodyKalmanFilter(nn.Module):
         cov = state.cov - step.U.mT @ step.U
         joints = a.joints(point)
         seen = see(self.maps, joints)
-        weighed = weigh(frame, seen, self.maps, state.beliefs, self.exchange)
+        weighed = weigh(readings, seen, self.maps, state.beliefs, self.exchange)
         off = (step.pulled * (G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
         fit = -0.5 * off - step.chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         after = BodyGaussian(
             a.swung(point, joints),
             (cov + cov.mT) / 2,
             torch.logit(weighed.exchanged, _ODDS),
-            self._next_scale(state.scale, frame, seen, weighed, joint_cov),
+            self._next_scale(state.scale, readings, seen, weighed, joint_cov),
             state.doubt,
         )
         evidence = weighed.log_evidence + fit
@@ -322,10 +325,15 @@ class BodyKalmanFilter(nn.Module):
         )
 
     def _next_scale(
-        self, scale: Tensor, frame: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Tensor
+        self,
+        scale: Tensor,
+        readings: KeypointFrame,
+        seen: Seen,
+        weighed: Weighed,
+        joint_cov: Tensor,
     ) -> Float[Tensor, "B C"]:
         """Return the factors of the cameras' noise, averaged over the last seconds."""
-        sums, count = squared_errors(frame, seen, weighed, joint_cov)
+        sums, count = squared_errors(readings, seen, weighed, joint_cov)
         share = (count / _SCALE_COUNT).clamp_max(1) / (_SCALE_TIME * self.fps)
         ratio = sums / count.clamp_min(1e-6)
         return (scale * (1 + share * (ratio - 1))).clamp(*NOISE_SCALES)
@@ -333,12 +341,12 @@ class BodyKalmanFilter(nn.Module):
     # --- joints elsewhere than predicted ------------------------------------------------------------
 
     def _doubts(
-        self, state: BodyGaussian, frame: KeypointFrame, found: _Linearised
+        self, state: BodyGaussian, readings: KeypointFrame, found: _Linearised
     ) -> tuple[Float[Tensor, "B J"], Bool[Tensor, "B J"]]:
         """Return the log-odds of joints elsewhere than predicted, given the keypoints, and which are."""
-        far = _blocks(found.G) + _JUMP**2 * torch.eye(3).to(found.G)
+        far = _blocks(found.G) + _JUMP**2 * _eye(3, found.G)
         at_large = weigh(
-            frame, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
+            readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )
         doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
         jumped = doubt > 0
@@ -352,13 +360,18 @@ def _of_tensors(fn: Callable[[Tensor], Tensor]) -> Callable[[Any], Any]:
 
 def _plus_one(matrix: Tensor) -> Tensor:
     """Return the symmetric part of a matrix plus the unit matrix."""
-    return (matrix + matrix.mT) / 2 + torch.eye(matrix.shape[-1]).to(matrix)
+    return (matrix + matrix.mT) / 2 + _eye(matrix.shape[-1], matrix)
+
+
+def _eye(size: int, like: Tensor) -> Tensor:
+    """Return a unit matrix of the dtype and on the device of a tensor."""
+    return torch.eye(size, dtype=like.dtype, device=like.device)
 
 
 def _factors(W: Float[Tensor, "B J 3 3"]) -> Tensor:
     """Return Cholesky factors of information that may be singular."""
     least = _JITTER * W.diagonal(dim1=-2, dim2=-1).sum(-1) + _LEAST_INFORMATION
-    return torch.linalg.cholesky(W + least[..., None, None] * torch.eye(3).to(W))
+    return torch.linalg.cholesky(W + least[..., None, None] * _eye(3, W))
 
 
 def _blocks(matrix: Float[Tensor, "B J3 J3"]) -> Float[Tensor, "B J 3 3"]:

@@ -30,6 +30,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     KeypointFrame,
     RigMaps,
     Seen,
+    readings_of,
     squared_errors,
     weigh,
 )
@@ -179,8 +180,11 @@ def _equations(
     maps = RigMaps.of(rig)
     beliefs = Beliefs(scale.new_full((count, len(rig), 2), _EXCHANGED), scale.expand(count, -1))
     cov = joints.new_zeros(*joints.shape, 3) if joint_cov is None else joint_cov
-    weighed = weigh(frames, seen, maps, beliefs, given.exchange, cov, decide=width < 2, width=width)
-    sums, number = squared_errors(frames, seen, weighed, cov)
+    readings = readings_of(frames, given.exchange)
+    weighed = weigh(
+        readings, seen, maps, beliefs, given.exchange, cov, decide=width < 2, width=width
+    )
+    sums, number = squared_errors(readings, seen, weighed, cov)
     ratio = sums.sum(0) / number.sum(0).clamp_min(1e-6) * width
     scale = (scale * ratio).clamp(*NOISE_SCALES) if joint_cov is not None else scale
     w = (weighed.own / weighed.variance)[..., None, None]

@@ -236,14 +236,14 @@ class KeypointBodyTracker(nn.Module):
 
     def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
         """Refuse keypoints most of which lie far outside an image: they are of another size."""
-        for c, (name, size) in enumerate(zip(self.rig.names, self.rig.sizes, strict=True)):
-            if size is None:
-                continue
-            points = pixels[..., c, :, :].reshape(-1, 2)
-            points = points[torch.isfinite(points).all(-1)]
-            side = torch.tensor([size[1], size[0]]).to(points)
-            outside = ((points < -side / 2) | (points > 1.5 * side)).any(-1)
-            if len(points) and float(outside.double().mean()) > 0.5:
+        sides = [(torch.inf, torch.inf) if size is None else size[::-1] for size in self.rig.sizes]
+        side = torch.tensor(sides).to(pixels)[:, None]
+        there = pixels.isfinite().all(-1)
+        outside = ((pixels < -side / 2) | (pixels > 1.5 * side)).any(-1) & there
+        counts = (value.movedim(-2, 0).flatten(1).sum(1) for value in (outside, there))
+        most = [2 * some > every for some, every in zip(*map(Tensor.tolist, counts), strict=True)]
+        for name, size, wrong in zip(self.rig.names, self.rig.sizes, most, strict=True):
+            if wrong and size is not None:
                 raise CameraError(
                     f"most keypoints of camera {name!r} lie outside its image of {size[1]} x "
                     f"{size[0]} pixels; if they are of a video of another size, take "

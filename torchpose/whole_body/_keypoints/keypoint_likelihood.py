@@ -33,6 +33,7 @@ __all__ = [
     "Weighed",
     "exchange_of",
     "information",
+    "readings_of",
     "see",
     "squared_errors",
     "weigh",
@@ -147,6 +148,12 @@ def exchange_of(skeleton: BodySkeleton) -> Exchange:
     return Exchange(mirror, torch.stack([sided & ~legs, sided & legs]).double())
 
 
+def readings_of(frame: KeypointFrame, exchange: Exchange) -> KeypointFrame:
+    """Return both readings of keypoints, [2, B, ...]: as of their own joints, and as of the other side's."""
+    mirror = exchange.mirror
+    return frame.map(lambda value: torch.stack([value, value.index_select(2, mirror)]))
+
+
 def see(maps: RigMaps, joints: Float[Tensor, "B J 3"]) -> Seen:
     """Return joints as cameras see them, u = (M p + m)_12 / (M p + m)_3, and how they move there.
 
@@ -163,7 +170,7 @@ def see(maps: RigMaps, joints: Float[Tensor, "B J 3"]) -> Seen:
 
 
 def weigh(
-    frame: KeypointFrame,
+    readings: KeypointFrame,
     seen: Seen,
     maps: RigMaps,
     beliefs: Beliefs,
@@ -177,6 +184,8 @@ def weigh(
     """Return the weights of keypoints by joints and their covariance.
 
     Args:
+        readings: [2, B, ...] of `readings_of`. seen: the joints as cameras see them. maps: the cameras.
+        beliefs: about the cameras. exchange: the groups of joints whose sides may be exchanged.
         joint_cov: of the joints; None is none. marginal: whether densities are N(r; 0, A P A^T + R), of a
             prediction, and not exp E[log N(r; 0, R)], of an estimate that the same keypoints made.
         decide: whether keypoints tell about exchanged sides; else the prior alone does.
@@ -187,19 +196,14 @@ def weigh(
         spread = seen.by_joint @ joint_cov.unsqueeze(-4) @ seen.by_joint.mT
     size = 0.5 * seen.by_joint.square().sum((-2, -1))  # about f^2 / depth^2
     scale = (width * beliefs.scale)[..., None]
-
-    def read(pixels: Tensor, variance: Tensor, relative: Tensor, inlier: Tensor) -> list[Tensor]:
-        variance = scale * (variance + relative * size)
-        inlier = torch.where(seen.in_front, inlier, 0.0)
-        density = _log_density(pixels - seen.pixels, spread, variance, marginal)
-        log_in = inlier.clamp_min(_LEAST).log() + density
-        both = torch.logaddexp(log_in, torch.log1p(-inlier) - maps.log_area[:, None])
-        present = inlier > 0
-        weight = torch.where(present, (log_in - both).exp(), 0.0)
-        return [weight, variance, torch.where(present, both, 0.0)]
-
-    own, variance, log_own = read(*frame)
-    other, other_variance, log_other = read(*(value[:, :, exchange.mirror] for value in frame))
+    variance = scale * (readings.variance + readings.relative * size)
+    inlier = torch.where(seen.in_front, readings.inlier, 0.0)
+    density = _log_density(readings.pixels - seen.pixels, spread, variance, marginal)
+    log_in = inlier.clamp_min(_LEAST).log() + density
+    either = torch.logaddexp(log_in, torch.log1p(-inlier) - maps.log_area[:, None])
+    present = inlier > 0
+    own, other = torch.where(present, (log_in - either).exp(), 0.0).unbind()
+    log_own, log_other = torch.where(present, either, 0.0).unbind()
     gain = (log_other - log_own) @ exchange.groups.mT
     log_odds = beliefs.log_odds
     exchanged = (log_odds + gain if decide else log_odds).sigmoid()
@@ -209,8 +213,8 @@ def weigh(
     return Weighed(
         own * (1 - swapped),
         other * swapped,
-        variance,
-        other_variance,
+        variance[0],
+        variance[1],
         exchanged,
         torch.lerp(log_own, log_other, swapped),
         log_own.sum((-2, -1)) + mixed.sum((-2, -1)),
@@ -234,24 +238,24 @@ def _log_density(
 
 
 def information(
-    frame: KeypointFrame, seen: Seen, weighed: Weighed, exchange: Exchange
+    readings: KeypointFrame, seen: Seen, weighed: Weighed
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
     """Return the information W_j = sum w A^T R^-1 A about joints, and the pull b_j = sum w A^T R^-1 r."""
     own, other = weighed.own / weighed.variance, weighed.other / weighed.other_variance
     weighted = seen.by_joint * (own + other)[..., None, None]
     matrix = (weighted.mT @ seen.by_joint).sum(1)
-    force = own[..., None] * (frame.pixels - seen.pixels)
-    force = force + other[..., None] * (frame.pixels[:, :, exchange.mirror] - seen.pixels)
+    off = readings.pixels - seen.pixels
+    force = own[..., None] * off[0] + other[..., None] * off[1]
     return matrix, (seen.by_joint.mT @ force[..., None]).squeeze(-1).sum(1)
 
 
 def squared_errors(
-    frame: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Float[Tensor, "B J 3 3"]
+    readings: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Float[Tensor, "B J 3 3"]
 ) -> tuple[Float[Tensor, "B C"], Float[Tensor, "B C"]]:
     """Return sums over joints of expected squared errors over the noise's variance, and their count.
 
     Only keypoints read as of their own joint count, by their weights: E[|r|^2] = |r|^2 + tr A P A^T.
     """
     spread = (seen.by_joint @ joint_cov.unsqueeze(-4) * seen.by_joint).sum((-2, -1))
-    square = (frame.pixels - seen.pixels).square().sum(-1) + spread
+    square = (readings.pixels[0] - seen.pixels).square().sum(-1) + spread
     return (weighed.own * square / weighed.variance).sum(-1), 2 * weighed.own.sum(-1)

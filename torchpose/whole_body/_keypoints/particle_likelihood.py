@@ -31,6 +31,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Weighed,
     exchange_of,
     information,
+    readings_of,
     see,
     weigh,
 )
@@ -71,10 +72,11 @@ def keypoint_log_likelihood(
         [B, N], float64; 0 in elements without a keypoint. No keypoint, however far off, lowers it by more
         than the density of outliers does.
     """
-    frame, seen, weighed, _ = _weighed(measured, joints)
+    readings, seen, weighed = _weighed(measured, joints)
     # a joint behind a camera makes its keypoint an outlier, which `weigh` leaves out
-    behind = (frame.inlier > 0) & ~seen.in_front
-    outlier = torch.log1p(-frame.inlier) - measured.maps.log_area[:, None]
+    inlier = readings.inlier[0]
+    behind = (inlier > 0) & ~seen.in_front
+    outlier = torch.log1p(-inlier) - measured.maps.log_area[:, None]
     value = weighed.log_evidence + torch.where(behind, outlier, 0.0).sum((-2, -1))
     return measured.power * value.view(joints.shape[:2])
 
@@ -117,8 +119,7 @@ def limbs_given_keypoints(
     # predicted where the part may be, a keypoint that is off by that much is no outlier
     spread = by_point.new_zeros(*joints.shape, 3)
     spread[:, :, carried] = by_point @ by_point.mT
-    frame, seen, weighed, exchange = _weighed(measured, joints, spread)
-    matrix, pull = information(frame, seen, weighed, exchange)
+    matrix, pull = information(*_weighed(measured, joints, spread))
     matrix, pull = matrix.view(spread.shape), pull.view(joints.shape)
     gained = by_point.mT @ matrix[:, :, carried] @ by_point
     pulled = (by_point.mT @ pull[:, :, carried, :, None]).squeeze(-1)
@@ -136,8 +137,8 @@ def _weighed(
     measured: KeypointMeasurement,
     joints: Float[Tensor, "B N J 3"],
     joint_cov: Float[Tensor, "B N J 3 3"] | None = None,
-) -> tuple[KeypointFrame, Seen, Weighed, Exchange]:
-    """Return the keypoints repeated for every particle, its joints in the cameras, and their weights."""
+) -> tuple[KeypointFrame, Seen, Weighed]:
+    """Return both readings of keypoints for every particle, its joints in the cameras, and the weights."""
     batch, n = joints.shape[:2]
     maps, exchange = measured.maps, exchange_of(BODY_15)
     exchange = Exchange(*(value.to(maps.shift.device) for value in exchange))
@@ -149,8 +150,9 @@ def _weighed(
     n_cameras = len(maps.shift)
     beliefs = Beliefs(new((batch * n, n_cameras, 2), _LOG_ODDS), new((batch * n, n_cameras), 1.0))
     spread = None if joint_cov is None else joint_cov.flatten(0, 1)
-    weighed = weigh(frame, seen, maps, beliefs, exchange, spread, marginal=spread is not None)
-    return frame, seen, weighed, exchange
+    readings = readings_of(frame, exchange)
+    weighed = weigh(readings, seen, maps, beliefs, exchange, spread, marginal=spread is not None)
+    return readings, seen, weighed
 
 
 def _carried(body: Body) -> tuple[Tensor, Tensor]:

@@ -25,6 +25,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     KeypointFrame,
     RigMaps,
     Seen,
+    readings_of,
     see,
     weigh,
 )
@@ -58,8 +59,9 @@ def detection_gains(
     seen = Seen(*(value[persons] for value in seen))
     beliefs = Beliefs(*(value[persons] for value in predicted.beliefs))
     weighed = weigh(
-        pairs, seen, filter.maps, beliefs, filter.exchange, joint_cov[persons], marginal=True
-    )
+        readings_of(pairs, filter.exchange), seen, filter.maps, beliefs, filter.exchange,
+        joint_cov[persons], marginal=True,
+    )  # fmt: skip
     there = pairs.inlier > 0
     gain = (weighed.log_joint - torch.where(there, _of_another(seen), 0.0)).sum(-1)
     gain = torch.where(there.any(-1), gain, -math.inf)
