@@ -387,12 +387,17 @@ def test_smoothing_sums_over_all_later_paths():
         return torch.where(hands[t, :, :, None, None], seen, unseen)
 
     def brute(first, last):
-        """Return the weights of the hypotheses of frame `first`, given all frames up to `last`."""
+        """The weights of the hypotheses of frame `first`, given all frames up to `last`.
+
+        Later frames count for a quarter where the hand is measured.
+        """
         paths = states[first].weight[..., None]
         paths = torch.diag_embed(paths[..., 0])
         for t in range(first + 1, last + 1):
             paths = (paths @ moves(t)) * said[t, :, :, None]
-        total = paths.sum(-1)
+        filtered = states[first].weight
+        power = torch.where(hands[first], 0.25, 1.0)[..., None]
+        total = filtered * (paths.sum(-1) / filtered) ** power
         return total / total.sum(-1, keepdim=True)
 
     for lag, lengths in ((None, None), (1, None), (2, None), (None, torch.tensor([3]))):

@@ -1,6 +1,7 @@
 """Windows and arms of bones averaged by their evidence."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -110,6 +111,27 @@ def test_sequences_of_a_batch_do_not_know_of_each_other(prior):
     both = tracker(keypoints, names=list(FEW), lengths=lengths)
     alone = tracker(keypoints[:1, :20], names=list(FEW))
     torch.testing.assert_close(both.joints3d[:1, :20], alone.joints3d, atol=1e-8, rtol=1e-6)
+
+
+def test_smoothed_odds_rest_on_what_was_predicted_before_and_after(prior):
+    """Not on windows with later frames in them, which predict any person well."""
+    filtered, smoothed = (
+        shares(prior, of_stranger(), smoothing=smoothing)[0] for smoothing in (None, "full")
+    )
+
+    def discounted(values):
+        sums = [values[0]]
+        for value in values[1:]:
+            sums.append(math.exp(-1 / 120) * sums[-1] + value)
+        return torch.stack(sums)
+
+    counts = torch.ones_like(filtered)
+    sums = (filtered.logit() - 0.5) / 0.5 * discounted(counts)
+    ratios = sums.clone()
+    ratios[1:] -= math.exp(-1 / 120) * sums[:-1]
+    both = [discounted(x) + discounted(x.flip(0)).flip(0) - x for x in (ratios, counts)]
+    expected = torch.sigmoid(1.0 + 0.5 * both[0] / both[1])
+    torch.testing.assert_close(smoothed, expected, atol=1e-6, rtol=0)
 
 
 def test_frames_without_arms_leave_the_odds(prior):

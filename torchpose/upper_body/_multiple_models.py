@@ -41,6 +41,7 @@ from torchpose.upper_body._fusion import (
     turned,
 )
 from torchpose.upper_body._measured_joints import MeasuredJoints
+from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
 __all__ = ["MultipleModelFilter", "MultipleModelState"]
@@ -48,7 +49,8 @@ __all__ = ["MultipleModelFilter", "MultipleModelState"]
 _LIMBS = [*ELBOWS, *HANDS]
 _MEMORY = 4.0  # seconds after which evidence counts for 1/e
 _SHARE = 0.5  # of the mean evidence of a frame that counts: frames are alike, so many are as few
-_FIRST = 0.5  # log-odds of windows before the first frame
+# Log-odds of windows before the first frame; those that contain later frames are better by more.
+_FIRST, _FIRST_SMOOTHED = 0.5, 1.0
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
 # between the two. As four sets have it that were in no fit.
 _BETWEEN = 0.5
@@ -98,6 +100,8 @@ class MultipleModelFilter(Estimator):
         self.model = model
         self.windows = WindowMixture(model)
         self.windows.of_limbs = True
+        self.causal = _causal(model) or self.windows
+        self.first = _FIRST if self.causal is self.windows else _FIRST_SMOOTHED
         self.articulated = ArticulatedFilter(model, arms)
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix.to(model.measurement_cov)
@@ -137,7 +141,9 @@ class MultipleModelFilter(Estimator):
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`.
 
-        With smoothing "full" the log-odds are those of the frames before and after.
+        With smoothing "full" the log-odds are those of the frames before and after. The evidence of windows
+        is always that of the window that ends with the frame: one with later frames in it predicts elbow and
+        hand better than any filter can, of persons that it does not know too.
         """
         if self.model.smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
@@ -147,7 +153,10 @@ class MultipleModelFilter(Estimator):
         if self._stage is not None:
             lag = stage_lag(self.model.smoothing, self.windows.ahead)
             reading = self._stage(reading, lengths, lag)
-        ratios = _log_ratios(seen, bodies, measured)
+        told = seen
+        if self.causal is not self.windows:
+            told = self.causal.forward(measured, joints, arm_generators, lengths)
+        ratios = _log_ratios(told, bodies, measured)
         if lengths is not None:
             frames = torch.arange(ratios.shape[1], device=ratios.device)
             ratios = ratios * (frames < lengths.to(ratios.device)[:, None])[..., None]
@@ -197,7 +206,7 @@ class MultipleModelFilter(Estimator):
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             reading = reading._replace(covs=recalibrated(reading.covs, noise, mode))
         mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
-        share = torch.sigmoid(_FIRST + _SHARE * mean_ratio)
+        share = torch.sigmoid(self.first + _SHARE * mean_ratio)
         mixed = _averaged(share, reading, bodies.reading, self.order)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
@@ -208,6 +217,16 @@ class MultipleModelFilter(Estimator):
             both = torch.stack([ours.log_evidence, theirs.log_evidence], -1)
             arms.append(theirs._replace(log_evidence=torch.logsumexp(logs + both, -1)))
         return Estimates(arms[0], arms[1], None, mixed, bodies.bones)
+
+
+def _causal(model: TrackerModel) -> WindowMixture | None:
+    """Return the estimator over windows that end with each frame; None where the prior has no such window."""
+    causal = model._replace(smoothing=None)
+    if model.smoothing is None or suitable_window(model.prior, None, model.rate) is None:
+        return None
+    windows = WindowMixture(causal)
+    windows.of_limbs = True
+    return windows
 
 
 def _log_ratios(
