@@ -101,7 +101,7 @@ def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
         "Jitter in the image: mean acceleration (px/s²), and distance from MediaPipe's joints (px)",
         [*GROUPS, *(f"{g}, distance" for g in GROUPS)],
         digits=(0, 0, 0, 0, 1, 1, 1, 1),
-        note="The head is the prior's (see torchpose.skeleton._mediapipe_landmarks), not MediaPipe's.",
+        note="The head is the prior's, not MediaPipe's.",
     )
     space = report.table(
         "jitter3d",
