@@ -25,7 +25,7 @@ def log_in_view(
     The torso is an elliptic cylinder below the shoulders. With the place x of a joint and the direction c
     of the camera relative to its axis, in its half-axes, the joint's ray meets the surface at s, if it does:
 
-        along = x . c,   s^2 = 1 - |x|^2 + along^2,   log (1 - (1 - h) P(hidden)),   h = 0.1
+        along = x . c,   s^2 = 1 - (x x c)^2,   log (1 - (1 - h) P(hidden)),   h = 0.1
 
     A joint is hidden if it is inside, |along| < s. From the front it is hidden behind the torso too,
     along < s. From behind it is not taken to be: arms are in front of the torso most of the time, and
@@ -35,18 +35,17 @@ def log_in_view(
         ends: places of elbows or hands, upright axes of the torso, from the camera, metres.
         shoulder, middle: of the same arm, and the middle of both, in the same axes.
     """
-    width = 2 * torch.linalg.vector_norm(shoulder - middle, dim=-1)[..., None, None]
-    off = (ends - middle[..., None, :]) / width
-    half = off.new_tensor([_WIDE, _DEEP])
-    flat, to_camera = off[..., ::2] / half, -middle[..., None, ::2] / half
-    to_camera = to_camera / torch.linalg.vector_norm(to_camera, dim=-1, keepdim=True)
-    along = (flat * to_camera).sum(-1)
-    beside = flat.square().sum(-1) - along.square()
+    width = 2 * torch.linalg.vector_norm(shoulder - middle, dim=-1)[..., None]
+    x, down, z = ((ends - middle[..., None, :]) / width[..., None]).unbind(-1)
+    x, z = x / _WIDE, z / _DEEP
+    to_camera = -middle[..., None, 0] / _WIDE, -middle[..., None, 2] / _DEEP
+    far = torch.hypot(*to_camera)
+    side, front = (value / far for value in to_camera)
+    along, beside = x * side + z * front, (x * front - z * side).square()
     surface = (1 - beside).clamp_min(1e-12).sqrt()
     inside = torch.sigmoid((surface - along.abs()) / _SOFT)
     behind = torch.sigmoid((surface - along) / _SOFT)
-    hidden = inside.lerp(behind, torch.sigmoid(-to_camera[..., 1] / _FACING))
-    down = off[..., 1]
+    hidden = inside.lerp(behind, torch.sigmoid(front / -_FACING))
     at_height = torch.sigmoid((down - _TOP) / _SOFT_TOP) * torch.sigmoid(
         (_BOTTOM - down) / _SOFT_BOTTOM
     )
