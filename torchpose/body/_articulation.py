@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.body._kinematics import Body
-from torchpose.body._limbs import level_plan
+from torchpose.body._limbs import chained, level_plan
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.math._rotations import (
     cross_matrix,
@@ -96,7 +96,6 @@ class Articulation(nn.Module):
     centres: Tensor
     carriers: Tensor
     in_group: Tensor
-    _order: Tensor
 
     def __init__(
         self,
@@ -284,11 +283,7 @@ class Articulation(nn.Module):
     def world_rotations(self, point: BodyPoint) -> Float[Tensor, "*batch P 3 3"]:
         """Return the rotation of every part, from part axes to world axes."""
         turns = self.centres @ point.rotations
-        world = [turns[..., :1, :, :]]
-        for depth in range(1, len(self.skeleton.part_levels)):
-            parts, above = self._level(depth, "parts"), self._level(depth, "above")
-            world.append(world[-1].index_select(-3, above) @ turns.index_select(-3, parts))
-        return torch.cat(world, -3).index_select(-3, self._order)
+        return chained(self, turns, len(self.skeleton.part_levels))
 
     def bones(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the bones from each joint's parent to it in the axes of the part that carries it."""

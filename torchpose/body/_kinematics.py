@@ -16,6 +16,7 @@ from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose.body._limbs import (
     Limbs,
+    chained,
     check_limb_lengths,
     checked_directions,
     checked_lengths,
@@ -98,7 +99,6 @@ class Body(nn.Module):
     tips: Tensor
     radii: Tensor
     centres: Tensor
-    _order: Tensor
 
     def __init__(
         self,
@@ -170,10 +170,11 @@ class Body(nn.Module):
         at = {name: i for i, name in enumerate(skeleton.points)}
         ends = [at[e] for limb in skeleton.limbs for e in (limb.start, limb.end)]
         centred = self.centres.requires_grad or bool(self.centres.any())
-        turns = torch.eye(3, dtype=torch.float64, device=offsets.device)
-        turns = turns.repeat(len(skeleton.parts), 1, 1)
         if centred:
             turns = quaternion_vector_to_matrix(self.centres.double())
+        else:  # as above, in a tenth of the time: every live frame has a body of its own
+            eye = torch.eye(3, dtype=torch.float64, device=offsets.device)
+            turns = eye.repeat(len(skeleton.parts), 1, 1)
         return _Geometry(
             offsets.to(dtype),
             turns.to(dtype),
@@ -272,13 +273,7 @@ class Body(nn.Module):
         if self.frame == "body":
             root, others = turns[..., :1, :, :], turns[..., 1:, :, :]
             return torch.cat([root, root @ others], -3)
-        above = turns[..., :1, :, :]
-        levels = [above]
-        for depth in range(1, len(self.skeleton.part_levels)):
-            parts, parents = self.get_buffer(f"_parts_{depth}"), self.get_buffer(f"_above_{depth}")
-            above = above.index_select(-3, parents) @ turns.index_select(-3, parts)
-            levels.append(above)
-        return torch.cat(levels, -3).index_select(-3, self._order)
+        return chained(self, turns, len(self.skeleton.part_levels))
 
     def joints(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch J 3"]:
         """Return the positions of all joints.

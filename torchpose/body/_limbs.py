@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.module_state import outside_inference
@@ -14,6 +14,7 @@ from torchpose.errors import InputError, ShapeError
 
 __all__ = [
     "Limbs",
+    "chained",
     "check_limb_lengths",
     "check_limbs",
     "checked_directions",
@@ -142,18 +143,18 @@ def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tens
 
 
 @lru_cache(maxsize=16)
+@outside_inference()
 def _carried(skeleton: BodySkeleton) -> Float[Tensor, "P N N"]:
     """Return whether a part turns the offset of a point on the way from the root to another, N = J + K."""
     n_joints, n_points = len(skeleton.names), len(skeleton.points)
     parents = [*skeleton.parents, *(skeleton.joint(tip.joint) for tip in skeleton.tips)]
     parts = [*skeleton.part_of, *(skeleton.part(tip.part) for tip in skeleton.tips)]
-    with outside_inference():
-        carried = torch.zeros(len(skeleton.parts), n_points, n_points, dtype=torch.float64)
-        joints = [joint for level in skeleton.joint_levels[1:] for joint in level]
-        for point in (*joints, *range(n_joints, n_points)):  # moves with all that moves its parent
-            carried[..., point] = carried[..., parents[point]]
-            carried[parts[point], point, point] = 1
-        return carried
+    carried = torch.zeros(len(skeleton.parts), n_points, n_points, dtype=torch.float64)
+    joints = [joint for level in skeleton.joint_levels[1:] for joint in level]
+    for point in (*joints, *range(n_joints, n_points)):  # moves with all that moves its parent
+        carried[..., point] = carried[..., parents[point]]
+        carried[parts[point], point, point] = 1
+    return carried
 
 
 def check_limb_lengths(skeleton: BodySkeleton, limb_weights: Tensor) -> None:
@@ -166,6 +167,22 @@ def check_limb_lengths(skeleton: BodySkeleton, limb_weights: Tensor) -> None:
             f"limb {limb.name!r} has zero length: {limb.start!r} and {limb.end!r} are one point; "
             "move one of them, or leave the limb out"
         )
+
+
+def chained(
+    module: nn.Module, turns: Float[Tensor, "*batch P 3 3"], n_levels: int
+) -> Float[Tensor, "*batch P 3 3"]:
+    """Return the products of all turns from the root to each part.
+
+    Args:
+        module: with a buffer for each entry of `level_plan`. turns: of every part in the part above.
+        n_levels: of the tree of parts.
+    """
+    world = [turns[..., :1, :, :]]
+    for depth in range(1, n_levels):
+        parts, above = module.get_buffer(f"_parts_{depth}"), module.get_buffer(f"_above_{depth}")
+        world.append(world[-1].index_select(-3, above) @ turns.index_select(-3, parts))
+    return torch.cat(world, -3).index_select(-3, module.get_buffer("_order"))
 
 
 def level_plan(skeleton: BodySkeleton) -> dict[str, list[int]]:

@@ -98,10 +98,14 @@ class MultipleModelFilter(Estimator):
 
     def __init__(self, model: TrackerModel, arms: ArmPrior | str | Path | None = None) -> None:
         self.model = model
-        self.windows = WindowMixture(model)
-        self.windows.of_limbs = True
-        self.causal = _causal(model) or self.windows
-        self.first = _FIRST if self.causal is self.windows else _FIRST_SMOOTHED
+        self.windows = self.causal = _windows_of_limbs(model)
+        self.first = _FIRST
+        if (
+            model.smoothing is not None
+            and suitable_window(model.prior, None, model.rate) is not None
+        ):
+            self.causal = _windows_of_limbs(model._replace(smoothing=None))
+            self.first = _FIRST_SMOOTHED
         self.articulated = ArticulatedFilter(model, arms)
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix.to(model.measurement_cov)
@@ -154,7 +158,7 @@ class MultipleModelFilter(Estimator):
             lag = stage_lag(self.model.smoothing, self.windows.ahead)
             reading = self._stage(reading, lengths, lag)
         told = seen
-        if self.causal is not self.windows:
+        if self.causal is not self.windows:  # of all that this computes the evidence alone is used
             told = self.causal.forward(measured, joints, arm_generators, lengths)
         ratios = _log_ratios(told, bodies, measured)
         if lengths is not None:
@@ -219,12 +223,9 @@ class MultipleModelFilter(Estimator):
         return Estimates(arms[0], arms[1], None, mixed, bodies.bones)
 
 
-def _causal(model: TrackerModel) -> WindowMixture | None:
-    """Return the estimator over windows that end with each frame; None where the prior has no such window."""
-    causal = model._replace(smoothing=None)
-    if model.smoothing is None or suitable_window(model.prior, None, model.rate) is None:
-        return None
-    windows = WindowMixture(causal)
+def _windows_of_limbs(model: TrackerModel) -> WindowMixture:
+    """Return the estimator over windows, whose evidence is that of elbow and hand alone."""
+    windows = WindowMixture(model)
     windows.of_limbs = True
     return windows
 

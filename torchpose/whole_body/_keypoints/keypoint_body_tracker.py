@@ -240,10 +240,10 @@ class KeypointBodyTracker(nn.Module):
         side = torch.tensor(sides).to(pixels)[:, None]
         there = pixels.isfinite().all(-1)
         outside = ((pixels < -side / 2) | (pixels > 1.5 * side)).any(-1) & there
-        counts = (value.movedim(-2, 0).flatten(1).sum(1) for value in (outside, there))
-        most = [2 * some > every for some, every in zip(*map(Tensor.tolist, counts), strict=True)]
-        for name, size, wrong in zip(self.rig.names, self.rig.sizes, most, strict=True):
-            if wrong and size is not None:
+        wrong, every = (value.movedim(-2, 0).flatten(1).sum(1) for value in (outside, there))
+        most = (2 * wrong > every).tolist()
+        for name, size, refused in zip(self.rig.names, self.rig.sizes, most, strict=True):
+            if refused and size is not None:
                 raise CameraError(
                     f"most keypoints of camera {name!r} lie outside its image of {size[1]} x "
                     f"{size[0]} pixels; if they are of a video of another size, take "

@@ -142,15 +142,14 @@ def _weighed(
     batch, n = joints.shape[:2]
     maps, exchange = measured.maps, exchange_of(BODY_15)
     exchange = Exchange(*(value.to(maps.shift.device) for value in exchange))
-    frame = KeypointFrame(
-        *(v[:, None].expand(-1, n, *v.shape[1:]).flatten(0, 1) for v in measured.frame)
+    readings = readings_of(measured.frame, exchange).map(
+        lambda v: v[:, :, None].expand(-1, -1, n, *v.shape[2:]).flatten(1, 2)
     )
     seen = see(maps, joints.flatten(0, 1).to(maps.shift))
     new = maps.shift.new_full
     n_cameras = len(maps.shift)
     beliefs = Beliefs(new((batch * n, n_cameras, 2), _LOG_ODDS), new((batch * n, n_cameras), 1.0))
     spread = None if joint_cov is None else joint_cov.flatten(0, 1)
-    readings = readings_of(frame, exchange)
     weighed = weigh(readings, seen, maps, beliefs, exchange, spread, marginal=spread is not None)
     return readings, seen, weighed
 
