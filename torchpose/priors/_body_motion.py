@@ -146,12 +146,6 @@ class BodyMotion(nn.Module):
         slope = torch.einsum("kij,...kj->...i", precisions, weighted)
         return PosePull(slope, curvature)
 
-    def log_density(
-        self, angles: Float[Tensor, "*batch Q"], cov: Float[Tensor, "*batch Q Q"]
-    ) -> Float[Tensor, "*batch"]:
-        """Return log sum_k pi_k N(theta; mu_k, Sigma_k + P), up to a constant; arguments as of `pull`."""
-        return self._log_shares(self.poses.means - angles[..., None, :], cov).logsumexp(-1)
-
     def _log_shares(
         self, gaps: Float[Tensor, "*batch K Q"], cov: Float[Tensor, "*batch Q Q"]
     ) -> Float[Tensor, "*batch K"]:

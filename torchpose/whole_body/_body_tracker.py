@@ -111,8 +111,6 @@ class BodyTracker(nn.Module):
             fit body`; in Python also the `BodyMotion` itself.
         up: of "kalman", "y" or "z", the axis of the world that points up; people are then expected upright.
             By default one camera is taken to be about level, and of several nothing is expected.
-        lifting: of "kalman" in one camera, whether a network that lifts keypoints corrects the poses; it
-            knows adults who stand, walk and exercise, seen by a camera that is about level.
         **options: the options of the method's filter (`torchpose.whole_body._filter_table.method_options`),
             such as sharpness, limits, leg_swap or n_layers.
 
@@ -160,7 +158,6 @@ class BodyTracker(nn.Module):
         pixel_std: float | None = None,
         motion: BodyMotion | str | Path | None = None,
         up: str | None = None,
-        lifting: bool = True,
         **options: Unpack[BodyTrackerOptions],
     ) -> None:
         super().__init__()
@@ -179,12 +176,11 @@ class BodyTracker(nn.Module):
             self.by_keypoints = KeypointBodyTracker(
                 as_rig(cameras), fps, body=person, height=height,
                 motion=load_body_motion(motion) if isinstance(motion, str | Path) else motion,
-                keypoint_std=keypoint_std, pixel_std=pixel_std, up=up, lifting=lifting,
+                keypoint_std=keypoint_std, pixel_std=pixel_std, up=up,
             )  # fmt: skip
             self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return
         unused = [name for name, value in (("motion", motion), ("up", up)) if value is not None]
-        unused += ["lifting"] * (not lifting)
         _refuse(unused, f"without method={KEYPOINT_METHOD!r}")
         height = _HEIGHT if height is None else height
         self.method = choose_method(method, given)

@@ -99,7 +99,7 @@ def test_who_is_upright_is_seen_so_where_up_is_known():
     pixels = rig(joints).pixels
 
     def lean(**options) -> float:
-        found = tracker(rig, lifting=False, **options)(keypoints=pixels).joints3d[10:]
+        found = tracker(rig, **options)(keypoints=pixels).joints3d[10:]
         trunk = (found[:, J("neck")] - found[:, J("pelvis")]).mean(0)
         return float(torch.acos(trunk[1] / trunk.norm()))
 

@@ -1,5 +1,6 @@
-"""The network that lifts one camera is causal and sized by the person; it corrects means, not covariances."""
+"""The network that lifts one camera is causal and sized by the person, and a measurement of the filter."""
 
+import cv2
 import pytest
 import torch
 
@@ -8,13 +9,20 @@ from benchmarks.keypoint_bodies.clips import MHAD, begun, read_clips
 from tests.data import data_dir_or_skip
 from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, ring, scene
 from torchpose.body import BODY_15, Body
-from torchpose.body._articulation import Articulation
-from torchpose.errors import FileFormatError, InputError
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.errors import FileFormatError
 from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_start import _points
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.known_person import with_body
-from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, corrected_by, nothing_lifted
+from torchpose.whole_body._keypoints.lifted_pose import (
+    _FACTOR,
+    PoseLifter,
+    corrected_by,
+    place_on_rays,
+)
 from torchpose.whole_body._keypoints.lifting_network import (
     Lifted,
     LiftingNetwork,
@@ -24,6 +32,9 @@ from torchpose.whole_body._keypoints.lifting_network import (
 )
 
 PELVIS = BODY_15.joint("pelvis")
+LIMBS = [
+    i for i, name in enumerate(BODY_15.names) if name.endswith(("elbow", "wrist", "knee", "ankle"))
+]
 
 
 def tracker(**options):
@@ -79,83 +90,136 @@ def test_a_saved_network_is_the_same_but_for_half_precision(tmp_path):
 
 
 def state_of(motion):
-    """A body that stands at the joints of a moving one, and a wide covariance."""
-    body = motion.articulation
-    joints = moving_body(1)
-    maps = torchpose.BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints.tracker.filter.maps
-    point = _points(body, motion, maps, joints, 1)
+    """A filter, and its state of a body that stands at the joints of a moving one, with a wide covariance."""
+    body, joints = motion.articulation, moving_body(1)
+    filter = KeypointTracker(ring(2), FPS, motion).filter
+    point = _points(body, motion, filter.maps, joints, 1)
     point = body.swung(point, joints, torch.ones(1, 15, dtype=torch.bool))
     cov = 0.05**2 * torch.eye(body.dim, dtype=torch.float64)
     scales = body.columns["scales"]
     cov[scales, scales] *= 1e-6
-    return point, cov[None]
+    new = point.position.new_zeros
+    return filter, BodyGaussian(point, cov[None], new(1, 2, 2), new(1, 2), new(1, 15))
+
+
+def lifted_from(joints, std, off=(0.0, 0.0, 0.0)):
+    wanted = relative(joints) + torch.tensor(off, dtype=torch.float64)
+    wanted[:, PELVIS] = 0
+    return Lifted(wanted, torch.full((1, 15), std, dtype=torch.float64))
 
 
 def test_what_was_lifted_moves_the_mean_as_far_as_it_is_sure():
-    motion = load_body_motion("whole-body")
-    body: Articulation = motion.articulation
-    point, cov = state_of(motion)
-    before = body.joints(point)
-    wanted = relative(before) + torch.tensor([0.0, 0.0, 0.04], dtype=torch.float64)
-    wanted[:, PELVIS] = 0
-    moved = {}
+    filter, state = state_of(load_body_motion("whole-body"))
+    body = filter.articulation
+    before = body.joints(state.mean)
+    gaps = []
     for std in (1e-4, 0.05, 10.0):
-        lifted = Lifted(wanted, torch.full((1, 15), std, dtype=torch.float64))
-        moved[std] = body.joints(corrected_by(lifted, body, point, cov))
-    gaps = [float((relative(x) - wanted)[0, 1:].norm(dim=-1).mean()) for x in moved.values()]
+        lifted = lifted_from(before, std, (0.0, 0.0, 0.04))
+        after = corrected_by(lifted, filter, state).mean
+        gaps.append(
+            float((relative(body.joints(after)) - lifted.joints).norm(dim=-1)[0, 1:].mean())
+        )
+        lengths = [body.bones(point).norm(dim=-1)[0, LIMBS] for point in (after, state.mean)]
+        torch.testing.assert_close(*lengths, atol=2e-3, rtol=0)
     assert gaps[0] < gaps[1] < gaps[2] < 0.0401
-    lengths = [
-        body.bones(corrected_by(lifted, body, point, cov)).norm(dim=-1)[0, 3:],
-        body.bones(point).norm(dim=-1)[0, 3:],
-    ]
-    torch.testing.assert_close(*lengths, atol=2e-3, rtol=0)
-    same = corrected_by(nothing_lifted(before), body, point, cov)
-    torch.testing.assert_close(body.joints(same), before)
+    nothing = corrected_by(lifted_from(before, torch.inf), filter, state)
+    torch.testing.assert_close(body.joints(nothing.mean), before)
+    torch.testing.assert_close(nothing.cov, state.cov)
+
+
+def test_the_correction_is_the_dense_kalman_update():
+    """Of a measurement so near that the joints are linear in the state."""
+    filter, state = state_of(load_body_motion("whole-body"))
+    body = filter.articulation
+    joints, jacobian = body.linearise(state.mean)
+    others = [j for j in range(15) if j != PELVIS]
+    lifted = lifted_from(joints, 0.07, (0.0, 2e-5, 1e-5))
+    H = (jacobian - jacobian[:, [PELVIS]])[0, others].reshape(-1, body.dim)
+    noise = (_FACTOR * 0.07) ** 2 * torch.eye(len(H), dtype=torch.float64)
+    gain = torch.linalg.solve(H @ state.cov[0] @ H.mT + noise, H @ state.cov[0]).mT
+    after = corrected_by(lifted, filter, state)
+    torch.testing.assert_close(
+        after.cov[0], state.cov[0] - gain @ H @ state.cov[0], atol=1e-7, rtol=0
+    )
+    step = gain @ (lifted.joints - relative(joints))[0, others].flatten()
+    expected = body.joints(body.moved(state.mean, step[None]))
+    torch.testing.assert_close(body.joints(after.mean), expected, atol=1e-8, rtol=0)
+
+
+def test_a_body_is_placed_on_its_rays_beside_a_wild_one():
+    generator = torch.Generator().manual_seed(0)
+    joints = 0.4 * torch.randn(1, 15, 3, generator=generator, dtype=torch.float64)
+    place = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
+    seen = joints + place
+    rays = seen[..., :2] / seen[..., 2:]
+    weights = torch.ones(1, 15, dtype=torch.float64)
+    torch.testing.assert_close(place_on_rays(joints, rays, weights)[0], place, atol=1e-4, rtol=0)
+    rays[0, 3] += 0.5
+    found = place_on_rays(joints, rays, weights)[0]
+    torch.testing.assert_close(found, place, atol=0.1, rtol=0)
+    weights[0, 3] = 0
+    torch.testing.assert_close(place_on_rays(joints, rays, weights)[0], place, atol=1e-4, rtol=0)
 
 
 def test_a_larger_person_is_lifted_larger_and_few_keypoints_are_not_lifted():
     motion = load_body_motion("whole-body")
     rig, pixels = ring(1), ring(1)(moving_body(1)).pixels
-    usual = PoseLifter(rig, FPS, motion)(frame_of(pixels), None)[0]
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    usual = PoseLifter(rig, FPS, motion, up)(frame_of(pixels), None)[0]
     large = with_body(motion, Body.of_height(BODY_15, 2.1))
-    other = PoseLifter(rig, FPS, large)(frame_of(pixels), None)[0]
+    other = PoseLifter(rig, FPS, large, up)(frame_of(pixels), None)[0]
     ratio = other.std / usual.std
     torch.testing.assert_close(ratio, ratio[:1, :1].expand_as(ratio))
     torch.testing.assert_close(other.joints, ratio[0, 0] * usual.joints)
     assert 1.1 < float(ratio[0, 0]) < 1.4
     few = frame_of(pixels)
     few.inlier[..., 5:] = 0
-    assert bool(PoseLifter(rig, FPS, motion)(few, None)[0].std.isinf().all())
+    assert bool(PoseLifter(rig, FPS, motion, up)(few, None)[0].std.isinf().all())
 
 
-def test_persons_of_no_fit_are_nearer_with_it():
+def test_a_camera_on_its_side_lifts_the_same_where_up_is_known():
+    motion, rig = load_body_motion("whole-body"), ring(1)
+    frame = frame_of(rig(moving_body(1)).pixels)
+    rolled = quarter_turned(rig)
+    turned = frame._replace(pixels=rolled(moving_body(1)).pixels)
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    usual, on_side = (
+        PoseLifter(one, FPS, motion, up)(given, None)[0]
+        for one, given in ((rig, frame), (rolled, turned))
+    )
+    torch.testing.assert_close(on_side.joints, usual.joints, atol=1e-4, rtol=0)
+    torch.testing.assert_close(on_side.std, usual.std, atol=1e-4, rtol=0)
+
+
+def quarter_turned(rig):
+    """The same camera, on its side."""
+    roll = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    rotation = cv2.Rodrigues((roll @ rig.rotation[0]).numpy())[0].ravel().tolist()
+    camera = PinholeCamera(
+        1300, 1300, 539.5, 959.5, 1080, 1920, "side",
+        rotation=rotation, translation=(roll @ rig.translation[0]).tolist(),
+    )  # fmt: skip
+    return CameraRig([camera])
+
+
+def test_strangers_are_nearer_than_the_best_still_pose():
     data = data_dir_or_skip(MHAD).parent
     names = {MHAD: ("s09_a09_sit_stand_r1", "s10_a05_wave_two_hands_r1")}
-    errors = dict.fromkeys((True, False), 0.0)
     for clip in read_clips(data, names)[MHAD]:
         one = begun(clip, 60).of_cameras(1)
-        for lifting in errors:
-            track = torchpose.BodyTracker(one.rig, "kalman", fps=one.fps, lifting=lifting)(
-                keypoints=one.seen.keypoints, confidence=one.seen.confidence
-            )
-            off = relative(track.joints3d) - relative(one.joints)
-            errors[lifting] += float(off.norm(dim=-1).nanmean())
-    assert errors[True] < 0.9 * errors[False]
+        track = torchpose.BodyTracker(one.rig, "kalman", fps=one.fps)(
+            keypoints=one.seen.keypoints, confidence=one.seen.confidence
+        )
+        true = relative(one.joints)
+        error, still = (
+            float((x - true).norm(dim=-1).nanmean())
+            for x in (relative(track.joints3d), true.mean(0))
+        )
+        assert error < 0.08
+        assert error < still
 
 
-def test_evidence_and_covariances_are_those_of_the_filter():
-    one = scene(1, 10)
-    given = {"keypoints": one.keypoints, "confidence": one.confidence, "names": NAMES}
-    lifted, alone = (tracker(lifting=lifting)(**given) for lifting in (True, False))
-    assert not torch.allclose(lifted.joints3d, alone.joints3d, atol=1e-3)
-    assert torch.equal(lifted.log_evidence, alone.log_evidence)
-    stds = [
-        x.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().mean() for x in (lifted, alone)
-    ]
-    assert float(stds[0] / stds[1]) == pytest.approx(1.0, abs=0.1)
-
-
-def test_steps_are_corrected_as_whole_sequences_are():
+def test_steps_are_lifted_as_whole_sequences_are():
     one = scene(1, 6)
     whole = tracker()(keypoints=one.keypoints, confidence=one.confidence, names=NAMES)
     live, state = tracker(), None
@@ -174,8 +238,16 @@ def test_a_module_in_double_precision_lifts_the_same():
     torch.testing.assert_close(single.joints3d, double.joints3d, atol=1e-4, rtol=0)
 
 
-def test_several_cameras_and_particle_filters_lift_nothing():
+def test_several_cameras_lift_nothing():
     assert torchpose.BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints.tracker.lifter is None
-    assert tracker(lifting=False).by_keypoints.tracker.lifter is None
-    with pytest.raises(InputError, match="lifting"):
-        torchpose.BodyTracker(ring(2), "sir", lifting=False)
+    assert tracker().by_keypoints.tracker.lifter is not None
+
+
+def test_nobody_at_first_is_no_error_and_begins_later():
+    one = scene(1, 8)
+    keypoints = one.keypoints.clone()
+    keypoints[:3] = torch.nan
+    track = tracker()(keypoints=keypoints, confidence=one.confidence, names=NAMES)
+    assert bool(track.joints3d.isfinite().all())
+    pixels = one.rig(track.joints3d).pixels
+    assert float((pixels - one.keypoints).norm(dim=-1)[5:].median()) < 20

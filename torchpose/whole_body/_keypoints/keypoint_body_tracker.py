@@ -34,7 +34,6 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointTracker,
 )
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
-from torchpose.whole_body._keypoints.lifted_pose import PoseLifter
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import known_up
 
@@ -62,7 +61,6 @@ class KeypointBodyTracker(nn.Module):
         keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
         pixel_std: pixels, how far they are apart from that; None is the usual, of both.
         up: "y" or "z", the axis of the world that points up, if it is known.
-        lifting: whether a network corrects the poses in one camera.
 
     Raises:
         InputError: values out of range. CameraError: cameras farther away than any room is large.
@@ -79,7 +77,6 @@ class KeypointBodyTracker(nn.Module):
         keypoint_std: float | None = None,
         pixel_std: float | None = None,
         up: str | None = None,
-        lifting: bool = True,
     ) -> None:
         super().__init__()
         self.rig, self.fps = rig, float(fps)
@@ -104,10 +101,7 @@ class KeypointBodyTracker(nn.Module):
         self.sized = body is not None or height is not None
         lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
         known = None if up is None else known_up(rig, up)
-        lifter = PoseLifter(rig, self.fps, motion) if alone and lifting else None
-        self.tracker = KeypointTracker(
-            rig, self.fps, motion, upright=known, lasting_std=lasting, lifter=lifter
-        )
+        self.tracker = KeypointTracker(rig, self.fps, motion, upright=known, lasting_std=lasting)
 
     @torch.no_grad()
     def forward(

@@ -1,16 +1,15 @@
 """Find the state in which a body begins: from the keypoints of one frame, without a guess.
 
-Joints are triangulated by the cameras that agree on them. Where there is one camera, they are put at the
-depth at which a person has the image's size. They tell where the trunk is and its axis. The filter's own
-correction then begins at several headings, with noise that is wide at first. Evidence tells which is right.
+Joints are triangulated by the cameras that agree on them. They tell where the trunk is, its axis and the
+limbs. The filter's own correction then begins at several headings, with noise that is wide at first. Evidence
+tells which is right. Where there is one camera, a network lifts the joints, which tells the heading too.
 """
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -24,10 +23,12 @@ from torchpose.whole_body._keypoints.body_kalman import (
 )
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.lifted_pose import corrected_by
+from torchpose.whole_body._keypoints.lifting_network import Lifted
 
-__all__ = ["Start", "start"]
+__all__ = ["start", "start_of_one"]
 
-_HEADINGS, _HEADINGS_OF_ONE = 8, 12
+_HEADINGS = 8
 _WIDTHS = (
     400.0,
     200.0,
@@ -41,141 +42,67 @@ _WIDTHS = (
     1.0,
     1.0,
 )  # factors of the noise's variance
-_COARSE, _HEADINGS_KEPT = 3, 2  # of these for all headings of one camera, which are then so many
+_WIDTHS_OF_ONE = _WIDTHS[-5:]
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
 _LOG_ODDS, _DOUBT = -6.0, -5.0
 _TRUNK = (("left_shoulder", "right_shoulder", "neck", "head"), ("left_hip", "right_hip", "pelvis"))
 _SIDED = ("shoulder", "hip")
 _LEAST_WIDTH = 0.05  # metres between left and right that tell a direction
-_TRUNK_SHARE, _BODY_SHARE = 0.28, 0.9  # of the height: from hips to shoulders, from ankles to head
-_DEFAULT_HEIGHT = 1.7
 
 
-class Start(NamedTuple):
-    """Holds hypotheses of a start, [B * M] corrected, and their log-evidence [B, M], the best first."""
-
-    found: CorrectedBody
-    log_weights: Tensor
-
-
-def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
-    """Return the likeliest hypotheses of a start.
-
-    Several cameras see the pose, so it is corrected from limbs along triangulated bones, at several headings.
-    One camera does not: there every component of the pose prior is a hypothesis of its own, and the best
-    heading of each is kept.
+def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
+    """Return the likeliest starts of B persons whom several cameras see.
 
     Args:
-        filter: that tracks on. frame: the first keypoints, of B persons.
-        count: of hypotheses for each person, at most.
+        filter: that tracks on. frame: the first keypoints.
     """
-    if len(filter.maps.shift) == 1:
-        return _start_of_one(filter, frame, count)
-    maps, body, motion = filter.maps, filter.articulation, filter.motion
-    joints = triangulate(maps, frame)
-    points = _points(body, motion, maps, joints, _HEADINGS)
-    joints = joints.repeat_interleave(_HEADINGS, 0)
-    points = body.swung(points, joints, joints.isfinite().all(-1))
-    state = filter.pulled(_state(points, _initial_cov(motion)[None], maps), 1.0)
-    found, evidence = _corrected(filter, state, frame, _WIDTHS)
-    return _likeliest(found, evidence, count)
+    joints = triangulate(filter.maps, frame)
+    state = _begun(filter, joints, joints.isfinite().all(-1), _HEADINGS)
+    every = torch.arange(len(joints), device=joints.device)
+    found = filter.correct(state, frame.take(every.repeat_interleave(_HEADINGS)), _WIDTHS)
+    best = found.log_evidence.view(-1, _HEADINGS).argmax(-1)
+    return found.take(every * _HEADINGS + best)
 
 
-def _start_of_one(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
-    """Return the likeliest hypotheses in one camera: the best heading of every component of the pose prior.
+def start_of_one(
+    filter: BodyKalmanFilter, frame: KeypointFrame, lifted: Lifted, joints: Float[Tensor, "B J 3"]
+) -> CorrectedBody:
+    """Return the starts of B persons whom one camera sees.
 
-    All headings are corrected with the widest noise, and of every component the best few with all of it.
+    Args:
+        filter: that tracks on. frame: the first keypoints. lifted: what a network makes of them.
+        joints: the same, where they fit the keypoints in the world.
     """
+    state = _begun(filter, joints, torch.ones_like(joints[..., 0], dtype=torch.bool), 1)
+    return filter.correct(corrected_by(lifted, filter, state), frame, _WIDTHS_OF_ONE)
+
+
+def _begun(
+    filter: BodyKalmanFilter,
+    joints: Float[Tensor, "B J 3"],
+    known: Bool[Tensor, "B J"],
+    n_headings: int,
+) -> BodyGaussian:
+    """Return wide Gaussians about bodies whose limbs point along joints, at every heading."""
     maps, body, motion = filter.maps, filter.articulation, filter.motion
-    points = _points(body, motion, maps, _at_one_depth(maps, frame, body), _HEADINGS_OF_ONE)
-    log_prior = motion.poses.weights.log()
-    state = _state(_posed(body, motion, points), _posed_covs(motion), maps)
-    kinds = len(log_prior)
-    _, evidence = _corrected(filter, state, frame, _WIDTHS[:_COARSE])
-    best = evidence.unflatten(1, (-1, kinds)).topk(_HEADINGS_KEPT, 1).indices
-    chosen = (best * kinds + _counted(kinds, best)).flatten(1)
-    state = state.take(_rows_of(chosen, evidence.shape[1]))
-    found, evidence = _corrected(filter, state, frame, _WIDTHS)
-    evidence, heading = (evidence.unflatten(1, (-1, kinds)) + log_prior).max(1)
-    found = found.take(_rows_of(heading * kinds + _counted(kinds, heading), _HEADINGS_KEPT * kinds))
-    return _likeliest(found, evidence, count)
+    points = _points(body, motion, maps, joints, n_headings)
+    joints, known = (value.repeat_interleave(n_headings, 0) for value in (joints, known))
+    points = body.swung(points, joints, known)
+    return filter.pulled(_state(points, _initial_cov(motion), maps), 1.0)
 
 
-def _corrected(
-    filter: BodyKalmanFilter, state: BodyGaussian, frame: KeypointFrame, widths: Sequence[float]
-) -> tuple[CorrectedBody, Float[Tensor, "B M"]]:
-    """Return the hypotheses of B persons, the same number of each, corrected, and their log-evidence."""
-    count = len(frame.pixels)
-    every = _counted(count, frame.pixels).repeat_interleave(len(state.scale) // count)
-    found = filter.correct(state, frame.take(every), widths)
-    return found, found.log_evidence.view(count, -1)
-
-
-def _likeliest(found: CorrectedBody, evidence: Float[Tensor, "B M"], count: int) -> Start:
-    """Return so many hypotheses at most, the best first."""
-    weights, best = evidence.topk(min(count, evidence.shape[1]), -1)
-    return Start(found.take(_rows_of(best, evidence.shape[1])), weights)
-
-
-def _rows_of(chosen: Int[Tensor, "B K"], n_each: int) -> Int[Tensor, " N"]:
-    """Return the rows of chosen hypotheses of each of B persons, who have so many each."""
-    return (_counted(len(chosen), chosen)[:, None] * n_each + chosen).flatten()
-
-
-def _counted(count: int, like: Tensor) -> Int[Tensor, " N"]:
-    return torch.arange(count, device=like.device)
-
-
-def _state(points: BodyPoint, covs: Float[Tensor, "#B N N"], maps: RigMaps) -> BodyGaussian:
-    """Return Gaussians about points that take the covariances in turn; nothing is known of cameras."""
+def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps) -> BodyGaussian:
+    """Return Gaussians about points; nothing is known of cameras."""
     count, n_cameras = len(points.position), len(maps.shift)
     new = points.position.new_full
     return BodyGaussian(
         points,
-        covs.repeat(count // len(covs), 1, 1),
+        cov.expand(count, *cov.shape),
         new((count, n_cameras, 2), _LOG_ODDS),
         new((count, n_cameras), 1.0),
         new((count, len(BODY_15.names)), _DOUBT),
     )
-
-
-def _posed(body: Articulation, motion: BodyMotion, points: BodyPoint) -> BodyPoint:
-    """Return the points with every component's mean pose, those of a point one after the other."""
-    means = motion.poses.means
-    angles = means.new_zeros(len(means), body.n_rotations)
-    angles[:, body.n_rotations - means.shape[1] :] = means
-    step = means.new_zeros(len(means), body.dim)
-    step[:, body.columns["rotations"]] = angles
-    every = torch.arange(len(points.position), device=means.device)
-    repeated = points.map(lambda value: value[every.repeat_interleave(len(means))])
-    return body.moved(repeated, step.repeat(len(points.position), 1))
-
-
-def _posed_covs(motion: BodyMotion) -> Float[Tensor, "K N N"]:
-    """Return the covariances of a start in every component of the pose prior."""
-    covs = _initial_cov(motion).repeat(len(motion.poses.weights), 1, 1)
-    columns = motion.articulation.relative_columns
-    covs[:, columns, columns] = motion.poses.covariances
-    return covs
-
-
-def _at_one_depth(
-    maps: RigMaps, frame: KeypointFrame, articulation: Articulation
-) -> Float[Tensor, "B J 3"]:
-    """Return the keypoints of the first camera at the depth at which a person has their size."""
-    there = (frame.inlier[:, 0] > 0)[..., None]
-    pixels = torch.where(there, frame.pixels[:, 0], torch.nan)
-    top, low = (_middle(articulation, pixels, names) for names in _TRUNK)
-    trunk = (top - low).norm(dim=-1) / _TRUNK_SHARE
-    high = torch.where(there, frame.pixels[:, 0], -math.inf).amax(1)
-    deep = torch.where(there, frame.pixels[:, 0], math.inf).amin(1)
-    box = (high - deep).amax(-1) / _BODY_SHARE
-    size = torch.where(trunk.isfinite(), torch.maximum(trunk, box), box).clamp_min(1.0)
-    focal = torch.linalg.det(maps.matrix[0]).abs().sqrt()
-    depth = focal * _DEFAULT_HEIGHT / size
-    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) * depth[:, None, None]
-    return torch.linalg.solve(maps.matrix[0], (homogeneous - maps.shift[0]).mT).mT
 
 
 def _middle(

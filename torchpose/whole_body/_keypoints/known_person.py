@@ -15,9 +15,6 @@ __all__ = ["length_of_legs", "of_one_camera", "with_body", "with_height"]
 
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
-_PROPORTIONS_SHARE = 0.3  # of the variance of proportions over persons
-_SHIFT_STD_OF_ONE, _SHIFT_TIME_OF_ONE = 0.015, 0.5  # metres, seconds
-_PULL_TIME_OF_ONE = 0.05  # seconds
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
 
 
@@ -47,29 +44,16 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
 
 
 def of_one_camera(motion: BodyMotion) -> BodyMotion:
-    """Return the prior for one camera, in which neither sizes nor the depths of limbs are seen.
+    """Return the prior for one camera, in which nothing tells a small person from a far one.
 
-    The legs together keep the length that is expected, since nothing tells a small person from a far one.
-    Proportions may differ from it, but less than over persons: corrections that are linear in lengths take a
-    bone that is turned for one that is short. For the same reason joints of the trunk shift little. Poses are
-    pulled to the mixture more strongly.
+    The legs together keep the length that is expected. Proportions have the covariance over persons whose
+    legs are equally long.
     """
-    given = {
-        "pull_time": torch.full_like(motion.pull_time, _PULL_TIME_OF_ONE),
-        "shift_std": torch.full_like(motion.shift_std, _SHIFT_STD_OF_ONE),
-        "shift_time": torch.full_like(motion.shift_time, _SHIFT_TIME_OF_ONE),
-        "scale_cov": _proportions_cov(motion),
-    }
-    return _with(motion, given)
-
-
-def _proportions_cov(motion: BodyMotion) -> Tensor:
-    """Return a share of the covariance of lengths of persons whose legs are equally long."""
     told = _of_legs(motion)
     cross = motion.scale_cov @ told
     cov = motion.scale_cov - cross[:, None] * cross / (told @ cross)
-    cov = _PROPORTIONS_SHARE * cov + _LENGTH_STD**2 * torch.eye(len(cov)).to(cov)
-    return (cov + cov.mT) / 2
+    cov = cov + _LENGTH_STD**2 * torch.eye(len(cov)).to(cov)
+    return _with(motion, {"scale_cov": (cov + cov.mT) / 2})
 
 
 def length_of_legs(motion: BodyMotion) -> float:

@@ -1,16 +1,11 @@
-"""Correct the pose of a body in one camera by what a network lifts.
+"""Lift the keypoints of one camera to a pose, which the filter takes for another measurement of the frame.
 
-The filter's errors in depth and the network's are nearly independent: one knows how bodies move and that
-they keep their lengths, the other what poses look like. The network has seen the same keypoints as the filter
-and is wrong for many frames in a row. So it takes part in the estimate of a frame, but not in the prediction
-of the next one:
+One camera does not see the depth of limbs. A network that has seen many poses tells the joints l_j that go
+with the keypoints, and their standard deviations s_j. The filter is corrected by
 
-    l_j = p_j(x) - p_pelvis(x) + e_j,   e_j ~ N(0, (c s_j)^2 I),
+    l_j = p_j(x) - p_pelvis(x) + e_j,   e_j ~ N(0, (1.5 s_j)^2 I),
 
-with the joints l_j that it found, their standard deviations s_j, and a factor c for persons unlike those that
-it was fitted to. The mean is that of an iterated extended Kalman filter. The covariance remains the filter's:
-on persons of neither fit it would be too small, since what two estimates of the same keypoints have in common
-is not known.
+before it is corrected by the keypoints themselves, so that these find limbs that point the right way.
 """
 
 import copy
@@ -19,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.known_person import length_of_legs
 from torchpose.whole_body._keypoints.lifting_network import (
@@ -32,11 +27,16 @@ from torchpose.whole_body._keypoints.lifting_network import (
     shipped_lifting_network,
 )
 
-__all__ = ["PoseLifter", "corrected_by", "nothing_lifted"]
+__all__ = ["PoseLifter", "corrected_by", "place_on_rays"]
 
-_FACTOR = 2.0  # on the network's standard deviations
-_ITERATIONS = 3
+_FACTOR = (
+    1.5  # on the network's standard deviations, which are those of persons that it was fitted to
+)
+_ITERATIONS = 2
 _LEAST_JOINTS = 6  # keypoints without which a frame is not lifted
+_PASSES, _CLOSE = 4, 0.1  # metres, from where on the error of a ray counts less
+_NEAREST = 0.5  # metres from the camera
+_LEAST_UP = 0.2  # share of the upward direction in the image plane, below which it tells no roll
 _PELVIS = BODY_15.joint("pelvis")
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
 
@@ -46,6 +46,7 @@ class PoseLifter(nn.Module):
 
     Args:
         rig: of one camera. fps: frames per second. motion: of the person, whose legs tell the size.
+        up: [3], the direction that is up, world axes, in which the image is turned upright.
         network: that lifts; the shipped one by default.
     """
 
@@ -54,16 +55,20 @@ class PoseLifter(nn.Module):
         rig: CameraRig,
         fps: float,
         motion: BodyMotion,
+        up: Float[Tensor, "3"],
         network: LiftingNetwork | None = None,
     ) -> None:
         super().__init__()
         self.network = copy.deepcopy(network or shipped_lifting_network())
         self.fps = fps
         self.size = length_of_legs(motion) / self.network.info.legs
-        self.register_buffer("matrix", rig.matrix[0].clone(), persistent=False)
-        self.register_buffer("rotation", rig.rotation[0].clone(), persistent=False)
-        self.matrix: Tensor
+        roll = _upright_roll(rig.rotation[0] @ up)
+        self.register_buffer("to_rays", roll @ torch.linalg.inv(rig.matrix[0]), persistent=False)
+        self.register_buffer("rotation", roll @ rig.rotation[0], persistent=False)
+        self.register_buffer("translation", roll @ rig.translation[0], persistent=False)
+        self.to_rays: Tensor
         self.rotation: Tensor
+        self.translation: Tensor
 
     def forward(
         self, frame: KeypointFrame, memory: Float[Tensor, "B L W"] | None
@@ -74,29 +79,77 @@ class PoseLifter(nn.Module):
             frame: of keypoints. memory: of the frame before; None at the beginning.
         """
         sure = frame.inlier[:, 0]
-        rays = (frame.pixels[:, 0] - self.matrix[:2, 2]) / self.matrix.diagonal()[:2]
+        rays = self._rays(frame)[..., :2]
         seen = lifting_features(rays, sure, self.fps).to(self.network.places.weight)
         lifted, memory = self.network(seen[:, None], memory)
         joints, std = (self.size * value[:, 0].to(rays) for value in lifted)
         enough = (sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS
         return Lifted(joints @ self.rotation, torch.where(enough, std, torch.inf)), memory
 
+    def placed(self, lifted: Lifted, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
+        """Return lifted joints in the world, where they lie near the rays of their keypoints.
 
-def nothing_lifted(joints: Float[Tensor, "*batch J 3"]) -> Lifted:
-    """Return what says nothing about these joints."""
-    return Lifted(torch.zeros_like(joints), torch.full_like(joints[..., 0], torch.inf))
+        Args:
+            lifted: of `forward`. frame: the keypoints.
+        """
+        joints = lifted.joints @ self.rotation.mT
+        place = place_on_rays(joints, self._rays(frame)[..., :2], frame.inlier[:, 0])
+        place = torch.cat([place[:, :2], place[:, 2:].clamp_min(_NEAREST)], -1)
+        return (joints + place[:, None] - self.translation) @ self.rotation
+
+    def _rays(self, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
+        pixels = frame.pixels[:, 0]
+        return torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) @ self.to_rays.mT
 
 
-def corrected_by(
-    lifted: Lifted, body: Articulation, mean: BodyPoint, cov: Float[Tensor, "B N N"]
-) -> BodyPoint:
-    """Return the mean of states given the joints that a network lifted.
+def _upright_roll(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Return the rotation about the optical axis that turns an upward direction to -y in the image."""
+    x, y = (-up[:2]).tolist()
+    long = (x * x + y * y) ** 0.5
+    if long < _LEAST_UP:  # the camera looks down or up, and any roll is as good
+        return torch.eye(3).to(up)
+    x, y = x / long, y / long
+    return torch.tensor([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]).to(up)
+
+
+def place_on_rays(
+    joints: Float[Tensor, "B J 3"], rays: Float[Tensor, "B J 2"], weights: Float[Tensor, "B J"]
+) -> Float[Tensor, "B 3"]:
+    """Return the translation that puts joints near the rays of their keypoints.
+
+    Of the place p of joints x and the rays (u, v, 1), u (x_z + p_z) = x_x + p_x, and so for v, are solved by
+    least squares, weighted, and from the second time on with less weight where the error is large.
 
     Args:
-        lifted: [B, J], world axes. body: whose states they are. mean, cov: of the states before.
+        joints: anywhere, camera axes. rays: anything finite where there is no keypoint.
+        weights: of the keypoints, 0 where there is none.
     """
-    precise = (1 / (_FACTOR * lifted.std[..., _OTHERS, None])).expand(*cov.shape[:-2], -1, 3)
-    scale = precise.flatten(-2)
+    aim = torch.cat([torch.eye(2).expand(*rays.shape, 2).to(rays), -rays[..., None]], -1)
+    wanted = rays * joints[..., 2:] - joints[..., :2]
+    small = 1e-6 * torch.eye(3).to(rays)
+    robust = torch.ones_like(weights)
+    place = torch.zeros_like(joints[..., 0, :])
+    for _ in range(_PASSES):
+        weighed = (weights * robust)[..., None, None] * aim
+        normal = (weighed.mT @ aim).sum(-3) + small
+        place = torch.linalg.solve(normal, (weighed.mT @ wanted[..., None]).sum(-3)).squeeze(-1)
+        off = ((aim @ place[..., None, :, None]).squeeze(-1) - wanted).norm(dim=-1)
+        robust = 1 / (1 + (off / _CLOSE).square())
+    return place
+
+
+def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) -> BodyGaussian:
+    """Return the Gaussians given the joints that a network lifted: an iterated extended Kalman filter's.
+
+    Args:
+        lifted: [B, J], world axes; the standard deviation is infinite where it says nothing.
+        filter: whose states they are. state: [B].
+    """
+    body, mean, cov = filter.articulation, state.mean, state.cov
+    scale = (1 / (_FACTOR * lifted.std[..., _OTHERS, None])).expand(
+        *lifted.joints[..., _OTHERS, :].shape
+    )
+    scale = scale.flatten(-2)
     point, d = mean, torch.zeros_like(cov[..., 0])
     for _ in range(_ITERATIONS):
         joints, jacobian = body.linearise(point)
@@ -110,4 +163,7 @@ def corrected_by(
         wanted = off[..., None] + H @ d[..., None]
         d = (HP.mT @ torch.cholesky_solve(wanted, chol)).squeeze(-1)
         point = body.moved(mean, d)
-    return body.swung(point, body.joints(point))
+    U = torch.linalg.solve_triangular(chol, HP, upper=False)
+    cov = cov - U.mT @ U
+    point = body.swung(point, body.joints(point))
+    return state._replace(mean=point, cov=(cov + cov.mT) / 2)

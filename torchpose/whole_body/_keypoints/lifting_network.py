@@ -28,7 +28,7 @@ _SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "lifting" / "whole-
 _JOINTS = len(BODY_15.names)
 INPUTS = 4 * _JOINTS + 4
 """Number of `lifting_features`."""
-_WIDTH, _LAYERS = 128, 2
+_WIDTH, _LAYERS = 256, 2
 _UNIT = 0.3  # metres of an output
 _RATE, _RATES = 60.0, (0.25, 1.0)  # frames per second of an input, and its limits
 _FARTHEST, _SMALLEST = 5.0, 1e-3  # extents of a body from its middle; extent of a ray
@@ -72,7 +72,7 @@ class LiftingNetwork(nn.Module):
     """Computes the joints of a body relative to its pelvis from keypoints of one camera, frame by frame.
 
     Two layers of gated recurrent units and a linear one. A second linear layer, of the same features, tells
-    the standard deviation of every joint. 0.18 million parameters.
+    the standard deviation of every joint. 0.66 million parameters.
 
     Args:
         info: facts about the fit.

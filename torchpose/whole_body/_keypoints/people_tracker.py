@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
+from torchpose.whole_body._keypoints.body_kalman import CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointPoses,
@@ -61,7 +61,7 @@ class PeopleFrame(NamedTuple):
 
     Attributes:
         number: [P]. identity: [P]. detection: [P, C], which detection of a camera is a person's, -1 if none.
-        keypoints: of these, [P, C, J]. poses: [P]. corrected: their hypotheses as one Gaussian.
+        keypoints: of these, [P, C, J]. poses: [P]. corrected: what their correction gave.
     """
 
     number: Tensor
@@ -115,9 +115,7 @@ class PeopleTracker:
         bodies = stream.bodies
         assert bodies is not None
         predicted = self.tracker.filter.predict(bodies.state)
-        n_persons, n_each = bodies.log_weights.shape
-        rows = torch.arange(n_persons, device=there.device) * n_each + bodies.log_weights.argmax(-1)
-        gains = detection_gains(self.tracker.filter, predicted.take(rows), frame)
+        gains = detection_gains(self.tracker.filter, predicted, frame)
         chosen = assign(gains)
         keypoints = taken_detections(frame, chosen)
         after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted)
@@ -210,11 +208,7 @@ class PeopleTracker:
         """Return the stream with some persons alone."""
         if stream.bodies is None or len(rows) == len(stream.number):
             return stream
-        bodies = stream.bodies
-        n_each = bodies.log_weights.shape[1]
-        every = (rows[:, None] * n_each + torch.arange(n_each, device=rows.device)).flatten()
-        state: BodyGaussian = bodies.state.take(every)
-        rest = KeypointStream(state, *(taken(value, rows) for value in bodies[1:]))
+        rest = taken(stream.bodies, rows)
         other: dict[str, Any] = {
             name: value[rows]
             for name, value in stream._asdict().items()
