@@ -7,7 +7,7 @@ same side of the split. Each of their files begins with a frame in the rest pose
 file in which the body falls apart is not used. Berkeley MHAD has no head.
 
 The persons of UTD-MHAD are seen from where their Kinect was, by one camera. Their skeletons are Kinect's,
-with other joints than motion capture has: none of the methods here has learned from such.
+with other joints than motion capture has. Lifters learn from half of them, s1 to s4.
 """
 
 from __future__ import annotations
@@ -56,6 +56,9 @@ SCORED = {
 
 KINECT_SCORED = tuple(f"s0{5 + action % 4}_a{action:02d}_*_t1" for action in range(1, 28))
 """Recordings of UTD-MHAD that are scored: every action of one of s5 to s8."""
+
+KINECT_TRAINING = ("s01_*", "s02_*", "s03_*", "s04_*")
+"""Patterns of the recordings of UTD-MHAD from which lifters learn."""
 
 TRAINING = {
     WALKS: ("s02_*", "s05_*", "s06_*", "s07_*", "s08_*", "s39_*"),
@@ -185,8 +188,7 @@ def read_kinect(
     rig, found = CameraRig([camera]), []
     for clip in recorded(data / KINECT, names):
         generator = torch.Generator().manual_seed(int(settings_hash([clip.trial, seed])[:8], 16))
-        joints = clip.joints.double()
-        joints[:, _PELVIS] = joints[:, _HIPS].mean(1)
+        joints = hips_for_pelvis(clip.joints.double())
         seen = detect(rig(joints).pixels, generator, faults)
         found.append(Clip(clip.trial, clip.fps, joints, clip.up.double(), rig, seen))
     return found
@@ -205,6 +207,13 @@ def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iter
         first = 1 if folder.name == ACTIONS else 0  # not the rest pose
         start = first + max(0, (len(clip) - first - longest) // 2)
         yield clip.cut(start, start + longest)
+
+
+def hips_for_pelvis(joints: Float[Tensor, "T 15 3"]) -> Float[Tensor, "T 15 3"]:
+    """Return joints with the middle of the hips as the pelvis."""
+    joints = joints.clone()
+    joints[:, _PELVIS] = joints[:, _HIPS].mean(1)
+    return joints
 
 
 def see(clip: MocapClip, seed: int = 0, faults: Faults = FAULTS, turn: float = 0.0) -> Clip:
@@ -249,7 +258,7 @@ def draw_ring(
     middle = (path.amin(0) + path.amax(0)) / 2
     floor = (joints @ up).nan_to_num(math.inf).min()
     foot = middle - (middle @ up - floor) * up
-    left = _mean_left(joints, up)
+    left = mean_left(joints, up)
     forward = torch.linalg.cross(left, up)
     drawn = torch.rand(len(_AZIMUTHS), 3, generator=generator, dtype=torch.float64)
     cameras = []
@@ -267,8 +276,12 @@ def _between(limits: tuple[float, float], share: Tensor) -> Tensor:
     return limits[0] + (limits[1] - limits[0]) * share
 
 
-def _mean_left(joints: Float[Tensor, "T 15 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Return the horizontal direction to the person's left, averaged over hips, shoulders and frames."""
+def mean_left(joints: Float[Tensor, "T 15 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Return the horizontal direction to the person's left, averaged over hips, shoulders and frames.
+
+    Args:
+        joints: of a recording. up: of the room.
+    """
     pairs = [[BODY_15.joint(f"{side}_{joint}") for joint in ("hip", "shoulder")]
              for side in ("left", "right")]  # fmt: skip
     across = (joints[:, pairs[0]] - joints[:, pairs[1]]).mean((0, 1))
@@ -311,7 +324,7 @@ def detect(
         pixels.shape, generator=generator, dtype=pixels.dtype
     )
     exchanged = _exchanges(shape, generator, faults)
-    found = torch.where(exchanged[..., None], noisy[..., _OTHER, :], noisy)
+    found = torch.where(exchanged[..., None], noisy[..., OTHER, :], noisy)
     outlier = torch.rand(shape, generator=generator) < faults.outliers
     found = torch.where(outlier[..., None], _wild(pixels, generator, faults), found)
     missing = bursts(shape, faults.missing, faults.missing_frames, generator)
@@ -347,7 +360,9 @@ def bursts(
     return torch.stack(states)
 
 
-_OTHER = [BODY_15.joint(other_side(name)) for name in BODY_15.names]
+OTHER = tuple(BODY_15.joint(other_side(name)) for name in BODY_15.names)
+"""The joint on the other side of each, and itself in the middle."""
+
 _LEGS, _ARMS = (
     torch.tensor([name.endswith(ends) for name in BODY_15.names])
     for ends in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist"))

@@ -1,9 +1,9 @@
 """Networks that lift keypoints of one camera to joints: of single frames, and causal.
 
-They are trained on all recordings of the persons of `clips.CHOOSING`, each in the first camera of several
-rings, with the detector's faults. Inputs are rays relative to the median of those of the frame, in units of
-their extent, which of them are there and how sure, that median and extent, and the frame rate. Outputs are
-joints relative to the pelvis in camera axes.
+They are trained on all recordings of the persons of `clips.TRAINING`, each in the first camera of several
+rings, and on those of `clips.KINECT_TRAINING` in the Kinect's place, with the detector's faults. Inputs are
+rays relative to the median of those of the frame, in units of their extent, which of them are there and how
+sure, that median and extent, and the frame rate. Outputs are joints relative to the pelvis in camera axes.
 """
 
 from __future__ import annotations
@@ -18,18 +18,25 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from benchmarks._lifters import Recurrent, draw_pieces, multilayer, train_lifter
-from benchmarks.keypoint_bodies.clips import TRAINING, Clip, recorded, see
+from benchmarks.keypoint_bodies.clips import (
+    KINECT_TRAINING,
+    TRAINING,
+    Clip,
+    read_kinect,
+    recorded,
+    see,
+)
 from benchmarks.keypoint_bodies.scoring import Estimate
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
+from torchpose.whole_body._keypoints.lifted_pose import place_on_rays
 from torchpose.whole_body._keypoints.lifting_network import INPUTS, lifting_features
 
 MLP, GRU, MEAN = "mlp", "gru", "mean-pose"
 _STEPS, _FRAMES = 4_000, 48
 _SEQUENCES = {MLP: 64, GRU: 32}
-_RINGS, _LONGEST = 6, 600  # of every recording; frames
+_RINGS, _KINECT_SEEDS, _LONGEST = 6, 3, 600  # of every recording; frames
 _TARGET = 0.3  # metres
-_PASSES, _CLOSE = 4, 0.1  # metres, from where on an error counts less
 _JOINTS = len(BODY_15.names)
 _PELVIS = BODY_15.joint("pelvis")
 
@@ -105,9 +112,6 @@ def placed(
 ) -> Float[Tensor, "T 15 3"]:  # fmt: skip
     """Return joints in the axes of the room, moved so that they lie near the rays of their keypoints.
 
-    Of the place p of a joint at x and its ray (u, v, 1), u (x_z + p_z) = x_x + p_x and so for v are solved
-    by least squares, weighted by confidence and, from the second time on, less where the error is large.
-
     Args:
         joints: anywhere, camera axes. rig: of one camera. keypoints: pixels, undistorted.
         confidence: of a detector.
@@ -115,17 +119,7 @@ def placed(
     matrix = rig.matrix[0]
     rays = (keypoints[:, 0] - matrix[:2, 2]) / matrix.diagonal()[:2]
     weights = torch.where(rays.isfinite().all(-1), confidence[:, 0], 0)
-    rays = rays.nan_to_num()
-    aim = torch.cat([torch.eye(2).expand(*rays.shape, 2).to(rays), -rays[..., None]], -1)
-    wanted = rays * joints[..., 2:] - joints[..., :2]
-    small = 1e-6 * torch.eye(3, dtype=rays.dtype)
-    robust = torch.ones_like(weights)
-    for _ in range(_PASSES):
-        weighed = (weights * robust)[..., None, None] * aim
-        normal = (weighed.mT @ aim).sum(1) + small
-        place = torch.linalg.solve(normal, (weighed.mT @ wanted[..., None]).sum(1))[..., 0]
-        off = ((aim @ place[:, None, :, None])[..., 0] - wanted).norm(dim=-1)
-        robust = 1 / (1 + (off / _CLOSE).square())
+    place = place_on_rays(joints, rays.nan_to_num(), weights)
     return (joints + place[:, None] - rig.translation[0]) @ rig.rotation[0]
 
 
@@ -162,12 +156,15 @@ def load_lifters(data: Path, file: Path | None, quick: bool) -> Mapping[str, Bod
 
 
 def make_examples(data: Path, quick: bool = False) -> Examples:
-    """Return the recordings of `clips.TRAINING`, each in the first camera of several rings.
+    """Return the recordings from which both networks learn.
 
     Args:
         data: folder with the sets. quick: one recording of each set in one ring.
     """
     pairs: list[tuple[Tensor, Tensor]] = []
+    chosen = ("s01_a01_*_t1",) if quick else KINECT_TRAINING
+    for seed in range(1, 2 if quick else 1 + _KINECT_SEEDS):
+        pairs += [_example(clip) for clip in read_kinect(data, chosen, seed)]
     for folder, patterns in TRAINING.items():
         for i, clip in enumerate(recorded(data / folder, patterns, _LONGEST)):
             if quick and i:

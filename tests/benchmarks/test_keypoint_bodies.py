@@ -211,7 +211,8 @@ def test_turned_rings_see_the_same_body_from_other_sides(walker):
 
 def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_size(tmp_path):
     data = data_dir_or_skip(WALKS).parent
+    data_dir_or_skip(KINECT)
     fit_shipped(data, quick=True).save(tmp_path / "lifting.safetensors")
     network = LiftingNetwork.load(tmp_path / "lifting.safetensors")
-    assert network.info.recordings == ("mocap_cmu_walk/s02_*",)
+    assert network.info.recordings == ("mocap_cmu_walk/s02_*", "kinect_utd_mhad/s01_*")
     assert 0.6 < network.info.legs < 1.0
