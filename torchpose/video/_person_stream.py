@@ -1,8 +1,8 @@
 """Track the poses of one person of a video, and decide whether left and right hand are swapped."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -153,9 +153,16 @@ class PersonStream(nn.Module):
             self.hands = [self.names.index(name) for name in ("hand_left", "hand_right")]
             self.exchanged = [self.names.index(_other_side(name)) for name in self.names]
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the tracker, as `to` asks for. Edges are compared on the CPU, where images are."""
+        if recurse:
+            self.tracker._apply(fn)
+        return super()._apply(fn, recurse=False)
+
     def init(self, number: int) -> PersonStreamState:
         """Return the state before the first frame of the person of this number."""
-        generator = torch.Generator().manual_seed(self.seed + number)
+        device = self.tracker.measurement_cov.device
+        generator = torch.Generator(device).manual_seed(self.seed + number)
         batch = 1 if self.association is None else 2
         stream = self.tracker.init(batch, self.names, generator)
         votes = None if self.association is None else self.association.init()
@@ -296,7 +303,7 @@ def _vote(
     for t, image in enumerate(images):
         if tells[t]:
             grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-            joints, size = poses.joints2d[None, :, t], measured.size[t : t + 1]
+            joints, size = poses.joints2d[None, :, t].cpu(), measured.size[t : t + 1]
             votes = association.step(votes, grey, joints, size, number)
         which.append(int(votes.swapped.any()))
     return votes, torch.tensor(which)
@@ -304,7 +311,8 @@ def _vote(
 
 def _choose(poses: PoseTrack, which: Tensor) -> PoseTrack:
     """Return one sequence, selected from two frame by frame."""
-    frames = torch.arange(len(which))
+    which = which.to(poses.joints2d.device)
+    frames = torch.arange(len(which), device=which.device)
     fields = {name: getattr(poses, name)[which, frames][None] for name in FRAME_FIELDS}
     failed = poses.failed_at[which]
     lost = (failed >= 0) & (frames >= failed)
@@ -330,7 +338,7 @@ def without_long_gaps(
 
 def _frames_since(seen: Bool[Tensor, " T"], unseen: int) -> Int[Tensor, " T"]:
     """Return the number of frames since the last one that was seen, after each frame."""
-    frames = torch.arange(len(seen))
+    frames = torch.arange(len(seen), device=seen.device)
     last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
     return frames - last
 

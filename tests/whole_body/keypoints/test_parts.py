@@ -107,7 +107,7 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     joints, jacobian = body.linearise(point)
     seen = see(maps, joints)
     spread = jacobian @ cov[:, None] @ jacobian.mT
-    exchange = exchange_of(BODY_15)
+    exchange = exchange_of(BODY_15, torch.device("cpu"))
     readings = readings_of(frame, exchange)
     weighed = weigh(readings, seen, maps, state.beliefs, exchange, spread, marginal=True)
     H = torch.einsum("bcjik,bjkn->bcjin", seen.by_joint, jacobian).reshape(-1, body.dim)

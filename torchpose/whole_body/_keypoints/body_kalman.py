@@ -150,7 +150,7 @@ class BodyKalmanFilter(nn.Module):
         super().__init__()
         self.motion, self.maps, self.fps, self.n_iterations = motion, maps, fps, n_iterations
         self.articulation, self.upright = motion.articulation, upright
-        self.exchange = exchange_of(self.articulation.skeleton)
+        self.exchange = exchange_of(self.articulation.skeleton, motion.acceleration.device)
         self.transition = transition(motion, 1 / fps)
         self._jump_variance = jump_variance(motion)
 

@@ -65,7 +65,7 @@ def transition(motion: BodyMotion, dt: float) -> BodyTransition:
     """
     body = motion.articulation
     at = body.columns
-    matrix = torch.eye(body.dim, dtype=torch.float64)
+    matrix = torch.eye(body.dim).to(motion.acceleration)
     noise = torch.zeros_like(matrix)
     pose, velocity = torch.arange(body.n_pose), _index(at["velocity"])
     keep = torch.exp(-motion.decay * dt)
@@ -83,9 +83,8 @@ def transition(motion: BodyMotion, dt: float) -> BodyTransition:
     scales = _index(at["scales"])
     noise[scales, scales] = _SCALE_DRIFT**2 * dt
     begin, end, lost = (1 - math.exp(-rate * dt) for rate in (_EXCHANGES, _RETURNS, _LOST))
-    device = motion.acceleration.device
     share = dt / float(motion.pull_time)
-    return BodyTransition(matrix.to(device), noise.to(device), share, begin, end, lost)
+    return BodyTransition(matrix, noise, share, begin, end, lost)
 
 
 def jump_variance(motion: BodyMotion) -> Float[Tensor, " N"]:

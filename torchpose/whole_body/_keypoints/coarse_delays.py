@@ -110,7 +110,7 @@ def shifted(
         beyond: factor of the trust in the first and last keypoints, which stand for those before and after.
     """
     count = len(frames.pixels)
-    rows = torch.arange(count)[:, None]
+    rows = torch.arange(count, device=delays.device)[:, None]
     places = (rows + delays).clamp(0, count - 1)
     moved = frames.map(lambda value: value[places, torch.arange(len(delays))])
     trust = torch.where(places == rows + delays, 1.0, beyond).to(moved.inlier)

@@ -139,13 +139,14 @@ class Weighed(NamedTuple):
     log_evidence: Tensor
 
 
-def exchange_of(skeleton: BodySkeleton) -> Exchange:
+def exchange_of(skeleton: BodySkeleton, device: torch.device) -> Exchange:
     """Return the groups of joints whose sides may be exchanged: arms, legs."""
     names = skeleton.names
     mirror = torch.tensor([names.index(other_side(n)) for n in names])
     sided = mirror != torch.arange(len(names))
     legs = torch.tensor([n.endswith(_LEGS) for n in names])
-    return Exchange(mirror, torch.stack([sided & ~legs, sided & legs]).double())
+    groups = torch.stack([sided & ~legs, sided & legs]).double()
+    return Exchange(mirror.to(device), groups.to(device))
 
 
 def readings_of(frame: KeypointFrame, exchange: Exchange) -> KeypointFrame:

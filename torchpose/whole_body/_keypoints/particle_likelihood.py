@@ -24,7 +24,6 @@ from torchpose.math._rotations import quaternion_vector_to_matrix, within_unit_b
 from torchpose.math._unscented import floor_eigenvalues, sigma_points
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Beliefs,
-    Exchange,
     KeypointFrame,
     RigMaps,
     Seen,
@@ -140,8 +139,7 @@ def _weighed(
 ) -> tuple[KeypointFrame, Seen, Weighed]:
     """Return both readings of keypoints for every particle, its joints in the cameras, and the weights."""
     batch, n = joints.shape[:2]
-    maps, exchange = measured.maps, exchange_of(BODY_15)
-    exchange = Exchange(*(value.to(maps.shift.device) for value in exchange))
+    maps, exchange = measured.maps, exchange_of(BODY_15, measured.maps.shift.device)
     readings = readings_of(measured.frame, exchange).map(
         lambda v: v[:, :, None].expand(-1, -1, n, *v.shape[2:]).flatten(1, 2)
     )

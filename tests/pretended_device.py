@@ -1,0 +1,168 @@
+"""A device that computes on the CPU and refuses what a GPU refuses: tensors of two devices in one operation.
+
+Inside `pretended_device`, ``tensor.to(PRETENDED)`` and factories with ``device=PRETENDED`` make tensors whose
+device is another than the CPU's. Numbers are those of the CPU.
+"""
+
+import contextlib
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map
+
+PRETENDED = "meta"
+"""The device under whose name the tensors go: torch needs no driver for it."""
+
+_COPIES = {"aten::copy_", "aten::_to_copy", "aten::_copy_from"}
+_INDEXED = {"aten::index.Tensor", "aten::index_put_", "aten::index_put", "aten::_index_put_impl_"}
+
+
+class _Elsewhere(torch.Tensor):
+    """A tensor of the CPU under the name of another device."""
+
+    @staticmethod
+    def __new__(cls, inner):
+        return torch.Tensor._make_wrapper_subclass(
+            cls, inner.shape, strides=inner.stride(), storage_offset=inner.storage_offset(),
+            dtype=inner.dtype, device=PRETENDED, requires_grad=False,
+        )  # fmt: skip
+
+    def __init__(self, inner):
+        self.inner = inner
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return _run(func, args, kwargs or {})
+
+    # in pieces, torch changes the shape of tensors in place
+    def __matmul__(self, other):
+        return _run(torch.ops.aten.matmul.default, (self, other), {})
+
+    def __rmatmul__(self, other):
+        return _run(torch.ops.aten.matmul.default, (other, self), {})
+
+    def __deepcopy__(self, memo):
+        return _Elsewhere(self.inner.clone())
+
+    def tolist(self):
+        return self.inner.tolist()
+
+    def numpy(self, *, force=False):
+        if not force:
+            raise TypeError("the tensor is on another device than NumPy's arrays")
+        return self.inner.numpy()
+
+    def new_tensor(self, data, **options):
+        return torch.tensor(data, **{"dtype": self.dtype, "device": "cpu", **options}).to(PRETENDED)
+
+    def __getitem__(self, index):
+        return super().__getitem__(_with_tensors(index))
+
+    def __setitem__(self, index, value):
+        super().__setitem__(_with_tensors(index), value)
+
+    def __repr__(self):
+        return f"elsewhere: {self.inner!r}"
+
+
+class _Mode(TorchDispatchMode):
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        return _run(func, args, kwargs or {})
+
+
+@contextlib.contextmanager
+def pretended_device() -> Iterator[None]:
+    """Let tensors be moved to the pretended device, and modules with `moved`."""
+    with pytest.MonkeyPatch.context() as patch, _Mode():
+        patch.setattr(torch, "tensor", _tensor_on(torch.tensor))
+        patch.setattr(torch, "autocast", _autocast_on(torch.autocast))
+        patch.setattr(torch, "Generator", _Generator)
+        # subclasses have no views in inference mode
+        patch.setattr(torch, "inference_mode", lambda mode=True: torch.no_grad())
+        yield
+
+
+def moved(module, device):
+    """Return the module on a device."""
+    before = torch.__future__.get_swap_module_params_on_conversion()
+    torch.__future__.set_swap_module_params_on_conversion(device == PRETENDED)
+    try:
+        return module.to(device)
+    finally:
+        torch.__future__.set_swap_module_params_on_conversion(before)
+
+
+_made = torch.Generator
+
+
+class _AnyGenerator(type(_made)):
+    def __instancecheck__(cls, value):
+        return isinstance(value, _made)
+
+
+class _Generator(_made, metaclass=_AnyGenerator):
+    """The CPU's generator, under the name of the pretended device too."""
+
+    def __new__(cls, device="cpu"):
+        return _made("cpu" if torch.device(device).type == PRETENDED else device)
+
+
+def _tensor_on(made):
+    # torch makes no data of Python's numbers for the meta device
+    def tensor(data, *, dtype=None, device=None, **options):
+        here = made(data, dtype=dtype, **options)
+        return here if device is None else here.to(device)
+
+    return tensor
+
+
+def _autocast_on(entered):
+    def autocast(device_type, *options, **named):
+        if device_type == PRETENDED:
+            return contextlib.nullcontext()
+        return entered(device_type, *options, **named)
+
+    return autocast
+
+
+def _run(func, args, kwargs):
+    name = func._schema.name
+    tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
+    there = [x for x in tensors if isinstance(x, _Elsewhere)]
+    wanted = kwargs.get("device")
+    if wanted is not None:
+        elsewhere = torch.device(wanted).type == PRETENDED
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    else:
+        elsewhere = bool(there)
+    full = f"{name}.{func._overloadname}" if func._overloadname != "default" else name
+    if there and name not in _COPIES:
+        checked = tensors
+        if full in _INDEXED:
+            first = args[0]
+            checked = [first, *([args[2]] if len(args) > 2 else [])]
+        strangers = [x for x in checked if not isinstance(x, _Elsewhere) and x.ndim > 0]
+        if strangers and len(there) > 0:
+            raise RuntimeError(
+                f"{full}: tensors of two devices, one of shape {list(strangers[0].shape)}"
+            )
+    result = func(*tree_map(_inner, args), **tree_map(_inner, kwargs))
+    if args and isinstance(args[0], torch.Tensor) and result is _inner(args[0]):  # in place
+        return args[0]
+    if not elsewhere:
+        return result
+    return tree_map(lambda x: _Elsewhere(x) if isinstance(x, torch.Tensor) else x, result)
+
+
+def _with_tensors(index):
+    if isinstance(index, tuple):
+        return tuple(_with_tensors(part) for part in index)
+    return torch.tensor(index).to(PRETENDED) if isinstance(index, list) else index
+
+
+def _inner(x):
+    return x.inner if isinstance(x, _Elsewhere) else x

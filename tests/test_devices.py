@@ -1,0 +1,213 @@
+"""Every tracker that is moved to a device computes there, and says what it says on the CPU.
+
+The device is a CUDA device where there is one, and in any case one that pretends to be another.
+"""
+
+import contextlib
+import math
+
+import pytest
+import torch
+
+import torchpose
+from tests.pretended_device import PRETENDED, moved, pretended_device
+from tests.whole_body.keypoints.scenes import FPS, NAMES, scene
+from torchpose.body import BODY_15, Body
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.upper_body import METHODS, method_options
+from torchpose.whole_body import METHODS as BODY_METHODS
+from torchpose.whole_body import render
+
+DEVICES = [
+    PRETENDED,
+    pytest.param(
+        "cuda",
+        marks=[
+            pytest.mark.cuda,
+            pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+        ],
+    ),
+]
+UPPER_BODY = list(KEYPOINT_NAMES)
+FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
+HALF = math.pi / math.sqrt(2)
+METRE = 1e-5  # what the order of sums may change over some tens of frames
+MODELS = {
+    "mrpf": {"manifold": "walk"},
+    "root": {"conditionals": "walk"},
+    "constrained": {"action": "exercises"},
+}
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    entered = pretended_device() if request.param == PRETENDED else contextlib.nullcontext()
+    with torch.no_grad(), entered:
+        yield request.param
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    """Two performers, one of whom hides a hand for a while."""
+    frames = torch.stack(
+        [noisy_keypoints(performer(7, seed=seed).joints, std_px=3.0) for seed in range(2)]
+    )
+    frames[1, 2:5, 2] = torch.nan
+    return frames
+
+
+@pytest.fixture(scope="module")
+def confidence(keypoints):
+    generator = torch.Generator().manual_seed(3)
+    shape = keypoints.shape[:-1]
+    return 0.3 + 0.7 * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+
+def upper_body(method, device):
+    options = {"n_particles": 60} if "n_particles" in method_options(method) else {}
+    prior = torchpose.load_prior("kinect-upper-body")
+    return moved(torchpose.UpperBodyTracker(prior, prior.camera, method, **options), device)
+
+
+def random(device):
+    return torch.Generator("cuda" if device == "cuda" else "cpu").manual_seed(0)
+
+
+def has_other_draws(method, device):
+    return device == "cuda" and ("n_particles" in method_options(method) or method == "mkf-sampled")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_upper_bodies(keypoints, confidence, method, device):
+    given = keypoints, confidence, UPPER_BODY
+    here = upper_body(method, "cpu")(*given, generator=random("cpu"))
+    tracker = upper_body(method, device)
+    there = tracker(*given, generator=random(device))
+    assert all(getattr(there, name).device.type == device for name in FIELDS)
+    state = tracker.init(len(keypoints), UPPER_BODY, random(device))
+    for t in range(keypoints.shape[1]):
+        state, pose = tracker.step(state, keypoints[:, t], confidence[:, t])
+    torch.testing.assert_close(pose.joints3d.cpu(), there.joints3d[:, -1].cpu(), rtol=0, atol=METRE)
+    if has_other_draws(method, device):
+        distance = (there.joints3d.cpu() - here.joints3d).norm(dim=-1)
+        assert float(distance.median()) < 0.1
+        return
+    torch.testing.assert_close(there.joints3d.cpu(), here.joints3d, rtol=0, atol=METRE)
+    torch.testing.assert_close(there.joints2d.cpu(), here.joints2d, rtol=0, atol=1e-2)
+    torch.testing.assert_close(
+        there.covariance3d.cpu(), here.covariance3d, rtol=1e-3, atol=METRE**2
+    )
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_whole_bodies(cameras, device):
+    tracks = []
+    for place in ("cpu", device):
+        seen = scene(cameras, 10)
+        tracker = moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS, up="y"), place)
+        given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
+        tracks.append(tracker(**given, smoothing="full"))
+    here, there = tracks
+    assert there.joints3d.device.type == device
+    torch.testing.assert_close(there.joints3d.cpu(), here.joints3d, rtol=0, atol=METRE)
+    torch.testing.assert_close(
+        there.covariance3d.cpu(), here.covariance3d, rtol=1e-3, atol=METRE**2
+    )
+    assert there.details.keys() == here.details.keys()
+    state = tracker.init()
+    for points, trust in zip(seen.keypoints, seen.confidence, strict=True):
+        state, pose = tracker.step(state, keypoints=points, confidence=trust, names=NAMES)
+    last = pose.joints3d.reshape(15, 3).cpu()  # which no later frame smooths
+    torch.testing.assert_close(last, here.joints3d[-1], rtol=0, atol=METRE)
+
+
+def test_cameras_that_are_slightly_wrong(device):
+    if device == PRETENDED:
+        pytest.skip("takes half a minute, and the notes about cameras above run most of it")
+    seen = scene(2, 12)
+    tracker = moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS), device)
+    given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
+    track = tracker(**given, refine="both")
+    error = (track.joints3d.cpu() - seen.joints[-len(track.joints3d) :]).norm(dim=-1)
+    assert float(error.mean()) < 0.05
+
+
+def test_several_persons(device):
+    seen = scene(3, 10)
+    tracker = moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS), device)
+    detections = torch.stack([seen.keypoints, seen.keypoints + 300], 2)
+    trust = torch.stack([seen.confidence, 0 * seen.confidence], 2)
+    (person,) = tracker(keypoints=detections, confidence=trust, names=NAMES, persons="all")
+    assert person.joints3d.device.type == device
+
+
+@pytest.fixture(scope="module")
+def silhouettes():
+    """Silhouettes of a body that stands still, the two small cameras, and its joints."""
+    cameras = [
+        PinholeCamera(80, 80, 39.5, 29.5, 80, 60, name, rotation=rotation, translation=(0, 0, 3))
+        for name, rotation in (("front", (math.pi, 0, 0)), ("side", (HALF, 0, HALF)))
+    ]
+    body, standing = Body.of_height(BODY_15, 1.75), torch.zeros(4, 36, dtype=torch.float64)
+    images = render(body, standing, CameraRig(cameras), 60, 80)
+    return images, cameras, body.joints(standing[0])
+
+
+@pytest.mark.parametrize("method", BODY_METHODS)
+def test_particles(method, silhouettes, device):
+    images, cameras, joints = silhouettes
+    pixels = CameraRig(cameras)(joints).pixels.expand(len(images), -1, -1, -1)
+    given = {"keypoints": pixels, "names": NAMES}
+    tracks = []
+    for place in ("cpu", device):
+        tracker = moved(
+            torchpose.BodyTracker(
+                CameraRig(cameras), method, n_particles=60, **MODELS.get(method, {})
+            ),
+            place,
+        )
+        start = torch.zeros(tracker.body.dim, dtype=torch.float64)
+        tracks.append(tracker(images, start, generator=random(place), **given))
+    here, there = tracks
+    assert there.joints3d.device.type == device
+    assert bool(there.joints3d.cpu().isfinite().all())
+    if device == PRETENDED:  # the same random numbers
+        torch.testing.assert_close(there.joints3d.cpu(), here.joints3d)
+
+
+class OneFace:
+    """Finds a face where the performer's is, so that OpenCV's detector is not needed."""
+
+    def __init__(self, face):
+        self.face = face
+
+    def __call__(self, image, region=None):
+        return self.face
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """Images of a performer, and a detector of the face."""
+    pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
+    from torchpose.demo._rendering import Scene, render_performance
+
+    shown = performer(20, distance=1.6)
+    scene = Scene(clutter=False, exposure=0.0)
+    images = list(render_performance([shown], demo_camera(), scene=scene))
+    head = demo_camera()(shown.joints[:, 3]).mean(0)[:2]
+    return images, OneFace(torch.tensor([[*head.tolist(), 90.0]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("options", [{}, {"edges": True}, {"method": "mkf-sampled"}])
+def test_video(filmed, options, device):
+    images, face = filmed
+    tracks = []
+    for place in ("cpu", device):
+        prior = torchpose.load_prior("kinect-upper-body")
+        tracker = torchpose.VideoTracker(prior, demo_camera(), face_detector=face, **options)
+        (person,) = moved(tracker, place)(images)
+        assert tracker.tracker.measurement_cov.device.type == place
+        tracks.append(person.track.joints3d.cpu())
+    if not (device == "cuda" and "method" in options):  # other random numbers
+        torch.testing.assert_close(tracks[1], tracks[0], rtol=0, atol=METRE)
