@@ -9,6 +9,7 @@ from benchmarks.keypoint_bodies.clips import MHAD, begun, read_clips
 from tests.data import data_dir_or_skip
 from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, ring, scene
 from torchpose.body import BODY_15, Body
+from torchpose.body._skeleton import other_side
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import FileFormatError
 from torchpose.priors._shipped import load_body_motion
@@ -200,6 +201,19 @@ def quarter_turned(rig):
         rotation=rotation, translation=(roll @ rig.translation[0]).tolist(),
     )  # fmt: skip
     return CameraRig([camera])
+
+
+def test_exchanged_sides_at_the_start_are_soon_forgotten():
+    joints, rig = moving_body(40), ring(1)
+    pixels = rig(joints).pixels
+    mirror = [NAMES.index(other_side(name)) for name in NAMES]
+    wrong = pixels.clone()
+    wrong[:3] = pixels[:3][..., mirror, :]
+    error = []
+    for seen in (pixels, wrong):
+        found = tracker()(keypoints=seen, names=NAMES).joints3d
+        error.append(float((relative(found) - relative(joints)).norm(dim=-1)[20:].mean()))
+    assert error[1] < error[0] + 0.02
 
 
 def test_strangers_are_nearer_than_the_best_still_pose():

@@ -19,7 +19,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
 from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
-from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, corrected_by
+from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, contradicts, corrected_by
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
@@ -140,8 +140,12 @@ class KeypointTracker(nn.Module):
             found = self._started(frame, lifted)
             stream = KeypointStream(found.state, enough, torch.zeros_like(waited), memory)
         else:
-            found = self._followed(stream, frame, lifted, predicted)
-            due = enough & (~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps))
+            predicted = self.filter.predict(stream.state) if predicted is None else predicted
+            found = self._followed(frame, lifted, predicted)
+            due = ~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps)
+            if lifted is not None:
+                due = due | contradicts(lifted, self.filter, predicted)
+            due = enough & due
             if bool(due.any()):
                 found = self._begun_anew(found, frame, lifted, due)
             stream = KeypointStream(
@@ -176,14 +180,9 @@ class KeypointTracker(nn.Module):
         return memory, lifted
 
     def _followed(
-        self,
-        stream: KeypointStream,
-        frame: KeypointFrame,
-        lifted: Lifted | None,
-        predicted: BodyGaussian | None = None,
+        self, frame: KeypointFrame, lifted: Lifted | None, predicted: BodyGaussian
     ) -> CorrectedBody:
-        """Return the persons of the stream in the next frame."""
-        predicted = self.filter.predict(stream.state) if predicted is None else predicted
+        """Return the persons of a stream in the next frame."""
         if lifted is not None:
             predicted = corrected_by(lifted, self.filter, predicted)
         return self.filter.correct(predicted, frame)

@@ -5,13 +5,15 @@ with the keypoints, and their standard deviations s_j. The filter is corrected b
 
     l_j = p_j(x) - p_pelvis(x) + e_j,   e_j ~ N(0, (1.5 s_j)^2 I),
 
-before it is corrected by the keypoints themselves, so that these find limbs that point the right way.
+before it is corrected by the keypoints themselves, so that these find limbs that point the right way. Where
+the filter expects another pose altogether, as after frames with exchanged sides, tracking begins anew with
+the lifted one.
 """
 
 import copy
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body._skeleton import BODY_15
@@ -27,10 +29,13 @@ from torchpose.whole_body._keypoints.lifting_network import (
     shipped_lifting_network,
 )
 
-__all__ = ["PoseLifter", "corrected_by", "place_on_rays"]
+__all__ = ["PoseLifter", "contradicts", "corrected_by", "place_on_rays"]
 
 _FACTOR = (
     1.5  # on the network's standard deviations, which are those of persons that it was fitted to
+)
+_CONTRADICTION = (
+    1.0  # mean square of e_j / (1.5 s_j): usually it is 0.1, and in one frame of a hundred 1
 )
 _ITERATIONS = 2
 _LEAST_JOINTS = 6  # keypoints without which a frame is not lifted
@@ -136,6 +141,20 @@ def place_on_rays(
         off = ((aim @ place[..., None, :, None]).squeeze(-1) - wanted).norm(dim=-1)
         robust = 1 / (1 + (off / _CLOSE).square())
     return place
+
+
+def contradicts(
+    lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian
+) -> Bool[Tensor, " B"]:
+    """Return whether lifted joints are nowhere near a prediction, so that one of the two is of another pose.
+
+    Args:
+        lifted: [B, J], world axes. filter: whose prediction it is. state: [B], the prediction.
+    """
+    joints = filter.articulation.joints(state.mean)
+    apart = lifted.joints - (joints - joints[..., [_PELVIS], :])
+    off = (apart / (_FACTOR * lifted.std[..., None]))[..., _OTHERS, :]
+    return off.square().mean((-2, -1)) > _CONTRADICTION
 
 
 def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) -> BodyGaussian:
