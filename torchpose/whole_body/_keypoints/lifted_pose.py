@@ -184,5 +184,4 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
         point = body.moved(mean, d)
     U = torch.linalg.solve_triangular(chol, HP, upper=False)
     cov = cov - U.mT @ U
-    point = body.swung(point, body.joints(point))
     return state._replace(mean=point, cov=(cov + cov.mT) / 2)
