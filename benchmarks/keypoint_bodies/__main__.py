@@ -3,7 +3,8 @@
 Recorded bodies (walks and actions of CMU, Berkeley MHAD) are seen by rings of cameras of 1920 x 1080 pixels
 at 3 to 5 m, through a detector with 4 px of noise, 10 % missing in bursts, 5 % outliers, and left and right
 exchanged in 3 % of the frames. Persons who are scored are not among those on whom constants were chosen,
-or methods learned. Persons whom a Kinect recorded are seen by one camera in its place. In the recording of
+or methods learned. Persons whom a Kinect recorded are seen by one camera in its place; lifters learned from
+others in the same place, and from nobody in the place of the other Kinect. In the recording of
 Pose2Sim a person is seen by four real cameras: every one is predicted from the others.
 
     python -m benchmarks.keypoint_bodies --data DIR [--out FILE] [--methods NAME ...] [--lifters FILE]
@@ -29,6 +30,7 @@ from benchmarks.keypoint_bodies.clips import (
     CHOOSING,
     KINECT,
     KINECT_SCORED,
+    OTHER_KINECT,
     RIGS,
     SCORED,
     begun,
@@ -43,6 +45,7 @@ from torchpose.evaluation import Report
 
 _ALL = (*METHODS, *LIFTERS)
 _KINECT_TITLE = "One camera, persons of a Kinect (mm)"
+_OTHER_TITLE = "One camera, a person of another Kinect (mm)"
 
 
 def main(
@@ -87,6 +90,8 @@ def main(
             add_table(report, chosen, clips, cameras)
         kinect = read_kinect(data, KINECT_SCORED[:1] if quick else KINECT_SCORED)
         add_table(report, chosen, {KINECT: kinect}, 1, _KINECT_TITLE)
+        other = read_kinect(data, ("Ges01*",) if quick else ("*",), folder=OTHER_KINECT)
+        add_table(report, chosen, {OTHER_KINECT: other}, 1, _OTHER_TITLE)
         add_real_table(report, chosen, data, quick)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))

@@ -7,7 +7,8 @@ same side of the split. Each of their files begins with a frame in the rest pose
 file in which the body falls apart is not used. Berkeley MHAD has no head.
 
 The persons of UTD-MHAD are seen from where their Kinect was, by one camera. Their skeletons are Kinect's,
-with other joints than motion capture has. Lifters learn from half of them, s1 to s4.
+with other joints than motion capture has. Lifters learn from half of them, s1 to s4. The person of the other
+Kinect is in no fit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip, read_mocap
 
 WALKS, ACTIONS, MHAD = "mocap_cmu_walk", "mocap_cmu_actions", "mocap_berkeley_mhad"
-KINECT = "kinect_utd_mhad"
+KINECT, OTHER_KINECT = "kinect_utd_mhad", "kinect_laban"
 
 CHOOSING = {
     WALKS: ("s02_02_01_walk", "s05_05_01_walk", "s06_06_01_walk", "s07_07_01_walk",
@@ -171,22 +172,26 @@ def read_clips(
 
 
 def read_kinect(
-    data: Path, names: Sequence[str] = KINECT_SCORED, seed: int = 0, faults: Faults = FAULTS
+    data: Path,
+    names: Sequence[str] = KINECT_SCORED,
+    seed: int = 0,
+    faults: Faults = FAULTS,
+    folder: str = KINECT,
 ) -> list[Clip]:
-    """Return recordings of UTD-MHAD in one camera where the Kinect was, with its axes.
+    """Return recordings of a Kinect in one camera where it was, with its axes.
 
     The pelvis is the middle of the hips, as detectors have it; Kinect's is higher.
 
     Args:
-        data: folder with the set. names: of files without their suffix, or patterns. seed: of faults.
-        faults: of the detector.
+        data: folder with the sets. names: of files without their suffix, or patterns. seed: of faults.
+        faults: of the detector. folder: `KINECT` or `OTHER_KINECT`.
     """
     camera = PinholeCamera(
         _KINECT_FOCAL, _KINECT_FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT, "kinect",
         rotation=(0.0, 0.0, math.pi), translation=(0.0, 0.0, 0.0),
     )  # fmt: skip
     rig, found = CameraRig([camera]), []
-    for clip in recorded(data / KINECT, names):
+    for clip in recorded(data / folder, names):
         generator = torch.Generator().manual_seed(int(settings_hash([clip.trial, seed])[:8], 16))
         joints = hips_for_pelvis(clip.joints.double())
         seen = detect(rig(joints).pixels, generator, faults)
@@ -200,7 +205,8 @@ def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iter
     Args:
         folder: of the set. names: of files without their suffix, or patterns. longest: frames.
     """
-    for path in (path for name in names for path in sorted(folder.glob(f"{name}.npz"))):
+    suffix = "csv" if folder.name == OTHER_KINECT else "npz"
+    for path in (path for name in names for path in sorted(folder.glob(f"{name}.{suffix}"))):
         (clip,) = read_mocap(path, fps=None)
         if clip.fps > FASTEST:
             (clip,) = read_mocap(path, fps=FASTEST)

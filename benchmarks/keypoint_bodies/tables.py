@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from tqdm.auto import tqdm
 
-from benchmarks.keypoint_bodies.clips import ACTIONS, KINECT, MHAD, WALKS, Clip
+from benchmarks.keypoint_bodies.clips import ACTIONS, KINECT, MHAD, OTHER_KINECT, WALKS, Clip
 from benchmarks.keypoint_bodies.methods import CAUSAL, Method, takes
 from benchmarks.keypoint_bodies.scoring import Score, score
 from torchpose.evaluation import Report
 
-_SETS = {WALKS: "walks", ACTIONS: "actions", MHAD: "MHAD", KINECT: "Kinect"}
+_SETS = {WALKS: "walks", ACTIONS: "actions", MHAD: "MHAD", KINECT: "Kinect",
+         OTHER_KINECT: "other Kinect"}  # fmt: skip
 _MEASURES = {
     "all": "error", "rigid": "rigid", "with scale": "similar", "seldom seen": "unseen",
     "exchanged": "exchanged", "jitter": "jitter", "50 %": "inside_50", "90 %": "inside_90",

@@ -14,6 +14,7 @@ from benchmarks.keypoint_bodies.clips import (
     KINECT,
     KINECT_SCORED,
     MHAD,
+    OTHER_KINECT,
     SCORED,
     WALKS,
     WIDTH,
@@ -188,7 +189,7 @@ def test_a_real_camera_is_predicted_from_the_others():
 
 def test_quick_run_prints_every_peer(run_here, tmp_path):
     data = data_dir_or_skip("mocap_cmu_walk").parent
-    for name in (ACTIONS, KINECT, MHAD, "multicam_pose2sim"):
+    for name in (ACTIONS, KINECT, OTHER_KINECT, MHAD, "multicam_pose2sim"):
         data_dir_or_skip(name)
     weights = tmp_path / "lifters.safetensors"
     names = [*PEERS, "gru", "mlp", "mean-pose"]
@@ -196,8 +197,9 @@ def test_quick_run_prints_every_peer(run_here, tmp_path):
     printed = run_here("keypoint_bodies.__main__", "--quick", *options, "--methods", *names)
     assert weights.is_file()
     assert printed.count("| pose2sim |") == 4
-    assert printed.count("| gru * |") == 3
+    assert printed.count("| gru * |") == 4
     assert "persons of a Kinect" in printed
+    assert "person of another Kinect" in printed
     assert (tmp_path / "keypoint_bodies.md").read_text().split() == printed.split()
 
 
