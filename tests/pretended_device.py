@@ -5,6 +5,8 @@ device is another than the CPU's. Numbers are those of the CPU.
 """
 
 import contextlib
+import inspect
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -77,13 +79,33 @@ class _Mode(TorchDispatchMode):
 @contextlib.contextmanager
 def pretended_device() -> Iterator[None]:
     """Let tensors be moved to the pretended device, and modules with `moved`."""
-    with pytest.MonkeyPatch.context() as patch, _Mode():
+    with pytest.MonkeyPatch.context() as patch, torch.no_grad(), _without_caches(), _Mode():
         patch.setattr(torch, "tensor", _tensor_on(torch.tensor))
         patch.setattr(torch, "autocast", _autocast_on(torch.autocast))
         patch.setattr(torch, "Generator", _Generator)
         # subclasses have no views in inference mode
         patch.setattr(torch, "inference_mode", lambda mode=True: torch.no_grad())
         yield
+
+
+@contextlib.contextmanager
+def _without_caches():
+    """Forget on both ends what functions of torchpose keep for a device: others use the same name."""
+    kept = [
+        value
+        for name, module in list(sys.modules.items())
+        if name.startswith("torchpose.")
+        for value in vars(module).values()
+        if hasattr(value, "cache_clear")
+        and "device" in inspect.signature(value.__wrapped__).parameters
+    ]
+    for function in kept:
+        function.cache_clear()
+    try:
+        yield
+    finally:
+        for function in kept:
+            function.cache_clear()
 
 
 def moved(module, device):

@@ -42,18 +42,21 @@ MODELS = {
 
 @pytest.fixture(params=DEVICES)
 def device(request):
-    entered = pretended_device() if request.param == PRETENDED else contextlib.nullcontext()
-    with torch.no_grad(), entered:
-        yield request.param
+    return request.param
+
+
+def use_of(device):
+    """The context in which a device can be used."""
+    return pretended_device() if device == PRETENDED else contextlib.nullcontext()
 
 
 @pytest.fixture(scope="module")
 def keypoints():
     """Two performers, one of whom hides a hand for a while."""
     frames = torch.stack(
-        [noisy_keypoints(performer(7, seed=seed).joints, std_px=3.0) for seed in range(2)]
+        [noisy_keypoints(performer(5, seed=seed).joints, std_px=3.0) for seed in range(2)]
     )
-    frames[1, 2:5, 2] = torch.nan
+    frames[1, 2:4, 2] = torch.nan
     return frames
 
 
@@ -82,64 +85,67 @@ def has_other_draws(method, device):
 def test_upper_bodies(keypoints, confidence, method, device):
     given = keypoints, confidence, UPPER_BODY
     here = upper_body(method, "cpu")(*given, generator=random("cpu"))
-    tracker = upper_body(method, device)
-    there = tracker(*given, generator=random(device))
-    assert all(getattr(there, name).device.type == device for name in FIELDS)
-    state = tracker.init(len(keypoints), UPPER_BODY, random(device))
-    for t in range(keypoints.shape[1]):
-        state, pose = tracker.step(state, keypoints[:, t], confidence[:, t])
-    torch.testing.assert_close(pose.joints3d.cpu(), there.joints3d[:, -1].cpu(), rtol=0, atol=METRE)
+    with use_of(device):
+        tracker = upper_body(method, device)
+        there = tracker(*given, generator=random(device))
+        assert all(getattr(there, name).device.type == device for name in FIELDS)
+        state = tracker.init(len(keypoints), UPPER_BODY, random(device))
+        for t in range(keypoints.shape[1]):
+            state, pose = tracker.step(state, keypoints[:, t], confidence[:, t])
+        found, last = {name: getattr(there, name).cpu() for name in FIELDS}, pose.joints3d.cpu()
+    torch.testing.assert_close(last, found["joints3d"][:, -1], rtol=0, atol=METRE)
     if has_other_draws(method, device):
-        distance = (there.joints3d.cpu() - here.joints3d).norm(dim=-1)
+        distance = (found["joints3d"] - here.joints3d).norm(dim=-1)
         assert float(distance.median()) < 0.1
         return
-    torch.testing.assert_close(there.joints3d.cpu(), here.joints3d, rtol=0, atol=METRE)
-    torch.testing.assert_close(there.joints2d.cpu(), here.joints2d, rtol=0, atol=1e-2)
-    torch.testing.assert_close(
-        there.covariance3d.cpu(), here.covariance3d, rtol=1e-3, atol=METRE**2
-    )
+    close = torch.testing.assert_close
+    close(found["joints3d"], here.joints3d, rtol=0, atol=METRE)
+    close(found["joints2d"], here.joints2d, rtol=0, atol=1e-2)
+    close(found["covariance3d"], here.covariance3d, rtol=1e-3, atol=METRE**2)
 
 
-@pytest.mark.parametrize("cameras", [1, 3])
+def body_tracker(seen, device):
+    return moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS, up="y"), device)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
 def test_whole_bodies(cameras, device):
-    tracks = []
-    for place in ("cpu", device):
-        seen = scene(cameras, 10)
-        tracker = moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS, up="y"), place)
-        given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
-        tracks.append(tracker(**given, smoothing="full"))
-    here, there = tracks
-    assert there.joints3d.device.type == device
-    torch.testing.assert_close(there.joints3d.cpu(), here.joints3d, rtol=0, atol=METRE)
-    torch.testing.assert_close(
-        there.covariance3d.cpu(), here.covariance3d, rtol=1e-3, atol=METRE**2
-    )
-    assert there.details.keys() == here.details.keys()
-    state = tracker.init()
-    for points, trust in zip(seen.keypoints, seen.confidence, strict=True):
-        state, pose = tracker.step(state, keypoints=points, confidence=trust, names=NAMES)
-    last = pose.joints3d.reshape(15, 3).cpu()  # which no later frame smooths
+    seen = scene(cameras, 6)
+    given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
+    here = body_tracker(seen, "cpu")(**given, smoothing="full")
+    with use_of(device):
+        tracker = body_tracker(seen, device)
+        there = tracker(**given, smoothing="full")
+        assert there.joints3d.device.type == device
+        state = tracker.init()
+        for points, trust in zip(seen.keypoints, seen.confidence, strict=True):
+            state, pose = tracker.step(state, keypoints=points, confidence=trust, names=NAMES)
+        joints, cov = there.joints3d.cpu(), there.covariance3d.cpu()
+        last = pose.joints3d.reshape(15, 3).cpu()  # which no later frame smooths
+    torch.testing.assert_close(joints, here.joints3d, rtol=0, atol=METRE)
+    torch.testing.assert_close(cov, here.covariance3d, rtol=1e-3, atol=METRE**2)
     torch.testing.assert_close(last, here.joints3d[-1], rtol=0, atol=METRE)
+    assert there.details.keys() == here.details.keys()
 
 
 def test_cameras_that_are_slightly_wrong(device):
     if device == PRETENDED:
         pytest.skip("takes half a minute, and the notes about cameras above run most of it")
     seen = scene(2, 12)
-    tracker = moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS), device)
     given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
-    track = tracker(**given, refine="both")
+    track = body_tracker(seen, device)(**given, refine="both")
     error = (track.joints3d.cpu() - seen.joints[-len(track.joints3d) :]).norm(dim=-1)
     assert float(error.mean()) < 0.05
 
 
 def test_several_persons(device):
-    seen = scene(3, 10)
-    tracker = moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS), device)
+    seen = scene(2, 6)
     detections = torch.stack([seen.keypoints, seen.keypoints + 300], 2)
     trust = torch.stack([seen.confidence, 0 * seen.confidence], 2)
-    (person,) = tracker(keypoints=detections, confidence=trust, names=NAMES, persons="all")
-    assert person.joints3d.device.type == device
+    given = {"keypoints": detections, "confidence": trust, "names": NAMES, "persons": "all"}
+    with use_of(device):
+        (person,) = body_tracker(seen, device)(**given)
+        assert person.joints3d.device.type == device
 
 
 @pytest.fixture(scope="module")
@@ -159,21 +165,21 @@ def test_particles(method, silhouettes, device):
     images, cameras, joints = silhouettes
     pixels = CameraRig(cameras)(joints).pixels.expand(len(images), -1, -1, -1)
     given = {"keypoints": pixels, "names": NAMES}
-    tracks = []
-    for place in ("cpu", device):
-        tracker = moved(
-            torchpose.BodyTracker(
-                CameraRig(cameras), method, n_particles=60, **MODELS.get(method, {})
-            ),
-            place,
-        )
+
+    def tracked(place):
+        options = {"n_particles": 60, **MODELS.get(method, {})}
+        tracker = moved(torchpose.BodyTracker(CameraRig(cameras), method, **options), place)
         start = torch.zeros(tracker.body.dim, dtype=torch.float64)
-        tracks.append(tracker(images, start, generator=random(place), **given))
-    here, there = tracks
-    assert there.joints3d.device.type == device
-    assert bool(there.joints3d.cpu().isfinite().all())
+        return tracker(images, start, generator=random(place), **given).joints3d
+
+    here = tracked("cpu")
+    with use_of(device):
+        there = tracked(device)
+        assert there.device.type == device
+        there = there.cpu()
+    assert bool(there.isfinite().all())
     if device == PRETENDED:  # the same random numbers
-        torch.testing.assert_close(there.joints3d.cpu(), here.joints3d)
+        torch.testing.assert_close(there, here)
 
 
 class OneFace:
@@ -199,15 +205,19 @@ def filmed():
     return images, OneFace(torch.tensor([[*head.tolist(), 90.0]], dtype=torch.float64))
 
 
-@pytest.mark.parametrize("options", [{}, {"edges": True}, {"method": "mkf-sampled"}])
-def test_video(filmed, options, device):
+def test_video(filmed, device):
+    if device == PRETENDED:
+        pytest.skip("videos are measured in a thread of their own, in which no device is pretended")
     images, face = filmed
-    tracks = []
-    for place in ("cpu", device):
+
+    def tracked(place):
         prior = torchpose.load_prior("kinect-upper-body")
-        tracker = torchpose.VideoTracker(prior, demo_camera(), face_detector=face, **options)
+        tracker = torchpose.VideoTracker(prior, demo_camera(), face_detector=face, edges=True)
         (person,) = moved(tracker, place)(images)
         assert tracker.tracker.measurement_cov.device.type == place
-        tracks.append(person.track.joints3d.cpu())
-    if not (device == "cuda" and "method" in options):  # other random numbers
-        torch.testing.assert_close(tracks[1], tracks[0], rtol=0, atol=METRE)
+        return person.track.joints3d.cpu()
+
+    here = tracked("cpu")
+    with use_of(device):
+        there = tracked(device)
+    torch.testing.assert_close(there, here, rtol=0, atol=METRE)
