@@ -19,16 +19,21 @@ from torchpose.upper_body import METHODS, method_options
 from torchpose.whole_body import METHODS as BODY_METHODS
 from torchpose.whole_body import render
 
-DEVICES = [
-    PRETENDED,
-    pytest.param(
-        "cuda",
-        marks=[
-            pytest.mark.cuda,
-            pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
-        ],
-    ),
+NEEDS_CUDA = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
 ]
+DEVICES = [PRETENDED, pytest.param("cuda", marks=NEEDS_CUDA)]
+
+
+def on_devices(methods, pretended):
+    """Every method on CUDA, and on the slower pretended device those that share least of their code."""
+    return [
+        *((name, PRETENDED) for name in pretended),
+        *(pytest.param(name, "cuda", marks=NEEDS_CUDA) for name in methods),
+    ]
+
+
 UPPER_BODY = list(KEYPOINT_NAMES)
 FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
 HALF = math.pi / math.sqrt(2)
@@ -81,7 +86,12 @@ def has_other_draws(method, device):
     return device == "cuda" and ("n_particles" in method_options(method) or method == "mkf-sampled")
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("method", "device"),
+    on_devices(
+        METHODS, ["window-mixture", "articulated", "mkf-fixed", "mkf-sampled", "pf-mixture"]
+    ),
+)
 def test_upper_bodies(keypoints, confidence, method, device):
     given = keypoints, confidence, UPPER_BODY
     here = upper_body(method, "cpu")(*given, generator=random("cpu"))
@@ -160,7 +170,9 @@ def silhouettes():
     return images, cameras, body.joints(standing[0])
 
 
-@pytest.mark.parametrize("method", BODY_METHODS)
+@pytest.mark.parametrize(
+    ("method", "device"), on_devices(BODY_METHODS, ["mrpf", "root", "constrained"])
+)
 def test_particles(method, silhouettes, device):
     images, cameras, joints = silhouettes
     pixels = CameraRig(cameras)(joints).pixels.expand(len(images), -1, -1, -1)
