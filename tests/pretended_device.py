@@ -164,11 +164,10 @@ def _run(func, args, kwargs):
     full = f"{name}.{func._overloadname}" if func._overloadname != "default" else name
     if there and name not in _COPIES:
         checked = tensors
-        if full in _INDEXED:
-            first = args[0]
-            checked = [first, *([args[2]] if len(args) > 2 else [])]
+        if full in _INDEXED:  # indices may lie anywhere
+            checked = [args[0], *args[2:3]]
         strangers = [x for x in checked if not isinstance(x, _Elsewhere) and x.ndim > 0]
-        if strangers and len(there) > 0:
+        if strangers:
             raise RuntimeError(
                 f"{full}: tensors of two devices, one of shape {list(strangers[0].shape)}"
             )

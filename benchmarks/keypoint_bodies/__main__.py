@@ -12,7 +12,7 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
 The second line prints what the constants of the filters of single joints were chosen by. The third fits the
-network that comes with torchpose and corrects poses in one camera.
+network that comes with torchpose and lifts the keypoints of one camera.
 """
 
 from __future__ import annotations

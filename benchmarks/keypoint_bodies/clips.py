@@ -205,8 +205,8 @@ def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iter
     Args:
         folder: of the set. names: of files without their suffix, or patterns. longest: frames.
     """
-    suffix = "csv" if folder.name == OTHER_KINECT else "npz"
-    for path in (path for name in names for path in sorted(folder.glob(f"{name}.{suffix}"))):
+    files = (path for name in names for path in sorted(folder.glob(f"{name}.*")))
+    for path in (path for path in files if path.suffix in (".npz", ".csv")):
         (clip,) = read_mocap(path, fps=None)
         if clip.fps > FASTEST:
             (clip,) = read_mocap(path, fps=FASTEST)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks._table_file import TableFile
 
@@ -218,6 +219,17 @@ def number(value: float, digits: int = 3) -> str:
     whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
     text = f"{value:,.{max(digits - whole, 0)}f}" if whole else f"{value:.{digits}g}"
     return text
+
+
+class OperationCounter(TorchDispatchMode):
+    """Counts the operations of torch that reach a kernel or make a view."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Count one operation, and run it."""
+        self.count += 1
+        return func(*args, **(kwargs or {}))
 
 
 class Report:

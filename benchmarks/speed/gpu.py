@@ -16,13 +16,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpose
 from benchmarks._command import run_command
 from benchmarks.keypoint_bodies.clips import CHOOSING, MHAD, Clip, read_clips
 from benchmarks.speed._arm import Problem, draw_sequences, make_filter, make_problem
-from benchmarks.speed._timing import Case, Setup, begin, number, take_turns
+from benchmarks.speed._timing import Case, OperationCounter, Setup, begin, number, take_turns
 from torchpose.demo import KEYPOINT_NAMES, noisy_keypoints, performer
 from torchpose.errors import InputError
 
@@ -290,7 +289,7 @@ def floor_text() -> str:
     with torch.inference_mode():
         for frame in keypoints[:, :6].to("cuda").unbind(1):
             state, _ = tracker.step(state, frame)
-        with _Counter() as counter:
+        with OperationCounter() as counter:
             for frame in keypoints[:, 6:].to("cuda").unbind(1):
                 state, _ = tracker.step(state, frame)
     operations = counter.count / 6
@@ -299,16 +298,6 @@ def floor_text() -> str:
         f"{operations:,.0f} of them or of views: {1e3 * start * operations:.1f} ms at most, the floor "
         "of a step on the GPU, whatever the number of streams."
     )
-
-
-class _Counter(TorchDispatchMode):
-    """Counts the operations that reach a kernel or make a view."""
-
-    count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
-        self.count += 1
-        return func(*args, **(kwargs or {}))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import time
 from typing import Any, NamedTuple
 
 from benchmarks._command import run_command
-from benchmarks.speed._timing import Setup, begin, number
+from benchmarks.speed._timing import OperationCounter, Setup, begin, number
 
 _FRAMES, _QUICK_FRAMES = 60, 8
 _BEGINS = 5  # frames that are not timed
@@ -62,18 +62,6 @@ def main(setup: Setup = Setup(threads=1)) -> None:
 def _row(case: _Case, n_frames: int, runs: int) -> tuple[str, ...]:
     """Return the figures of a case."""
     import torch
-    from torch.utils._python_dispatch import TorchDispatchMode
-
-    class Counter(TorchDispatchMode):
-        """Counts the operations that reach a kernel or make a view."""
-
-        count = 0
-
-        def __torch_dispatch__(
-            self, func: Any, types: Any, args: Any = (), kwargs: Any = None
-        ) -> Any:
-            self.count += 1
-            return func(*args, **(kwargs or {}))
 
     tracker, keypoints, confidence = _problem(case, n_frames)
     # what is made in inference mode is kept from no step to the next: the tracker is made outside of it
@@ -83,7 +71,7 @@ def _row(case: _Case, n_frames: int, runs: int) -> tuple[str, ...]:
         for t in range(n_frames - _COUNTED):
             state, _ = tracker.step(state, keypoints[:, t], confidence[:, t])
     wall, cpu = ([t for times in step_times for t in times[i]] for i in (0, 1))
-    with Counter() as counter, torch.inference_mode():
+    with OperationCounter() as counter, torch.inference_mode():
         for t in range(n_frames - _COUNTED, n_frames):
             state, _ = tracker.step(state, keypoints[:, t], confidence[:, t])
     times = (statistics.median(cpu), statistics.mean(cpu), statistics.median(wall))

@@ -136,7 +136,7 @@ class KeypointTracker(nn.Module):
         waited = frame.inlier.new_zeros(len(frame.inlier)) if stream is None else stream.lost
         enough = self._enough(frame, waited)
         if stream is None:
-            due = torch.ones_like(enough)
+            due = enough
             found = self._started(frame, lifted)
             stream = KeypointStream(found.state, enough, torch.zeros_like(waited), memory)
         else:
@@ -156,7 +156,7 @@ class KeypointTracker(nn.Module):
         pose = KeypointPoses(
             found.joints, self._lasting(found.joint_cov), found.state.mean, found.state.cov, inlier,
             found.weighed.exchanged, found.log_evidence,
-            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough,
+            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due,
         )  # fmt: skip
         return stream, pose, found
 
