@@ -49,8 +49,7 @@ __all__ = ["MultipleModelFilter", "MultipleModelState"]
 _LIMBS = [*ELBOWS, *HANDS]
 _MEMORY = 4.0  # seconds after which evidence counts for 1/e
 _SHARE = 0.5  # of the mean evidence of a frame that counts: frames are alike, so many are as few
-# Log-odds of windows before the first frame; those that contain later frames are better by more.
-_FIRST, _FIRST_SMOOTHED = 0.5, 1.0
+_FIRST = 0.5  # log-odds of windows before the first frame
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
 # between the two. As four sets have it that were in no fit.
 _BETWEEN = 0.5
@@ -99,13 +98,11 @@ class MultipleModelFilter(Estimator):
     def __init__(self, model: TrackerModel, arms: ArmPrior | str | Path | None = None) -> None:
         self.model = model
         self.windows = self.causal = _windows_of_limbs(model)
-        self.first = _FIRST
         if (
             model.smoothing is not None
             and suitable_window(model.prior, None, model.rate) is not None
         ):
             self.causal = _windows_of_limbs(model._replace(smoothing=None))
-            self.first = _FIRST_SMOOTHED
         self.articulated = ArticulatedFilter(model, arms)
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix.to(model.measurement_cov)
@@ -145,21 +142,19 @@ class MultipleModelFilter(Estimator):
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`.
 
-        With smoothing "full" the log-odds are those of the frames before and after. The evidence of windows
-        is always that of the window that ends with the frame: one with later frames in it predicts elbow and
-        hand better than any filter can, of persons that it does not know too.
+        With smoothing "full" the log-odds are those of the frames before and after. Windows with later frames
+        in them are surer of persons whom they do not know, and not better. So their evidence is that of the
+        windows that end with the frame, and their poses are averaged with those of these.
         """
         if self.model.smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
-        seen = self.windows.forward(measured, joints, arm_generators, lengths)
+        seen = told = self.windows.forward(measured, joints, arm_generators, lengths)
         bodies = self.articulated.forward(measured, joints, arm_generators, lengths, progress)
-        reading = read_out(seen, self.matrix, self.order)
-        if self._stage is not None:
-            lag = stage_lag(self.model.smoothing, self.windows.ahead)
-            reading = self._stage(reading, lengths, lag)
-        told = seen
-        if self.causal is not self.windows:  # of all that this computes the evidence alone is used
+        reading = self._steadied(seen, lengths)
+        if self.causal is not self.windows:
             told = self.causal.forward(measured, joints, arm_generators, lengths)
+            half = torch.full_like(reading.place[..., 0], 0.5)
+            reading = _averaged(half, reading, self._steadied(told, lengths), self.order)
         ratios = _log_ratios(told, bodies, measured)
         if lengths is not None:
             frames = torch.arange(ratios.shape[1], device=ratios.device)
@@ -169,6 +164,13 @@ class MultipleModelFilter(Estimator):
         if self.model.smoothing == "full":
             sums = sums + self._sums(none, ratios.flip(1)).flip(1) - ratios
         return repeat_last(self._mixed(sums, reading, seen, bodies, measured), lengths)
+
+    def _steadied(self, seen: Estimates, lengths: Tensor | None) -> ReadOut:
+        """Return the poses of windows over whole sequences, after their motion stage."""
+        reading = read_out(seen, self.matrix, self.order)
+        if self._stage is None:
+            return reading
+        return self._stage(reading, lengths, stage_lag(self.model.smoothing, self.windows.ahead))
 
     @property
     def _stage(self) -> MotionStage | None:
@@ -210,7 +212,7 @@ class MultipleModelFilter(Estimator):
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             reading = reading._replace(covs=recalibrated(reading.covs, noise, mode))
         mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
-        share = torch.sigmoid(self.first + _SHARE * mean_ratio)
+        share = torch.sigmoid(_FIRST + _SHARE * mean_ratio)
         mixed = _averaged(share, reading, bodies.reading, self.order)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
