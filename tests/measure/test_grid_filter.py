@@ -66,7 +66,7 @@ def test_prediction_is_the_sum_over_all_ways():
             np.testing.assert_allclose(found[n, k], expected, atol=2e-6)
 
 
-def brute_exclude(base, exclusion, radius, crossing, soft, rounds):
+def brute_exclude(base, exclusion, radius, crossing, soft, rounds, present=(1, 1)):
     base = [b / b.sum() for b in base]
     message = [np.ones((H, W)), np.ones((H, W))]
     for turn in range(2 * rounds):
@@ -80,8 +80,8 @@ def brute_exclude(base, exclusion, radius, crossing, soft, rounds):
                 gaussian_weight(x, c, W, soft) * other[:, : c + 1].sum() for c in range(W)
             )
             wrong[x] = 1 - left_of if k == 0 else left_of
-        message[k] = (1 - (1 - math.exp(-exclusion)) * taken) * (
-            1 - (1 - math.exp(-crossing)) * wrong
+        message[k] = (1 - (1 - math.exp(-exclusion)) * present[1 - k] * taken) * (
+            1 - (1 - math.exp(-crossing)) * present[1 - k] * wrong
         )
     out = [b * m for b, m in zip(base, message, strict=True)]
     return np.stack([o / o.sum() for o in out])
@@ -93,6 +93,16 @@ def test_exclusion_is_the_sum_over_the_other_hand():
     for n in range(2):
         expected = brute_exclude(base[n].double().numpy(), 2.5, 1.4, 2.8, 0.9, 2)
         np.testing.assert_allclose(found[n], expected, atol=2e-6)
+
+
+def test_a_hand_excludes_the_other_as_far_as_it_is_visible():
+    base, present = beliefs(3).square(), torch.tensor([[0.9, 0.2], [0.0, 1.0]])
+    found = exclude(base, 2.5, 1.4, 2.8, 0.9, present)
+    for n in range(2):
+        own = base[n].double().numpy(), 2.5, 1.4, 2.8, 0.9, 2, present[n].tolist()
+        np.testing.assert_allclose(found[n], brute_exclude(*own), atol=2e-6)
+    right = base[1, 1] / base[1, 1].sum()  # the left hand is gone
+    torch.testing.assert_close(found[1, 1], right, atol=1e-7, rtol=1e-5)
 
 
 def test_two_hands_do_not_take_one_place():

@@ -121,18 +121,20 @@ def exclude(
     radius: float,
     crossing: float,
     soft: float,
+    present: Float[Tensor, "N 2"] | None = None,
     rounds: int = 2,
 ) -> Float[Tensor, "N 2 h w"]:
     """Return the beliefs of the left and the right hand after mutual exclusion.
 
-        p_k(x) ~ b_k(x) (1 - (1 - e^-X) taken_l(x)) (1 - (1 - e^-C) wrong_l(x))
+        p_k(x) ~ b_k(x) (1 - (1 - e^-X) v_l taken_l(x)) (1 - (1 - e^-C) v_l wrong_l(x))
 
     taken_l is the probability of the other hand l within about `radius` of x. wrong_l is its
     probability on the wrong side of x: the person's left hand is seldom to the left of the right
-    hand in the image.
+    hand in the image. A hand that is not visible takes no place in it.
 
     Args:
         base: beliefs before, any scale. exclusion: X. crossing: C. radius, soft: cells.
+        present: v, the probability that each hand is visible; None is 1.
         rounds: of messages from each hand to the other.
     """
     base = (base / base.sum((2, 3), keepdim=True).clamp_min(1e-30)).clamp_min_(_LEAST)
@@ -141,6 +143,9 @@ def exclude(
     for turn in range(2 * rounds):  # one hand after the other: both at once would oscillate
         k = turn % 2
         taken, wrong = _occupied(belief[1 - k], k, radius, soft)
+        if present is not None:
+            there = present[:, 1 - k, None, None]
+            taken, wrong = taken.mul_(there), wrong.mul_(there)
         free = taken.mul_(math.expm1(-exclusion)).add_(1)
         belief[k] = hands[k] * free.mul_(wrong.mul_(math.expm1(-crossing)).add_(1))
     both = torch.stack(belief, 1)
