@@ -75,9 +75,12 @@ def watched(frames: Iterable[VideoFrame], own: list[int]) -> Iterator[VideoFrame
         yield frame
 
 
-def from_landmarks(prior: UpperBodyPrior, joints: Sequence[int]) -> Method:
-    """Return a method: joints [T, 8, 2] by the filter alone, from some of MediaPipe's."""
-    tracker = UpperBodyTracker(prior, PinholeCamera.from_image_size(*SIZE), fps=FPS, neck="neck")
+def from_landmarks(
+    prior: UpperBodyPrior, joints: Sequence[int], smoothing: str | None = None
+) -> Method:
+    """Return a method: joints [T, 8, 2] by the filter or smoother alone, from some of MediaPipe's."""
+    camera = PinholeCamera.from_image_size(*SIZE)
+    tracker = UpperBodyTracker(prior, camera, fps=FPS, neck="neck", smoothing=smoothing)
 
     def run(clip: Clip) -> Tensor:
         chosen = list(joints)
@@ -233,6 +236,7 @@ def main(
         "video": from_video(folder, fitted, False),
         "video, background model": from_video(folder, fitted, True),
         "MediaPipe's head, neck, hands": from_landmarks(fitted, (*TRUNK, *HANDS)),
+        "the same, smoothed": from_landmarks(fitted, (*TRUNK, *HANDS), "full"),
         "MediaPipe's head and neck": from_landmarks(fitted, TRUNK),
     }
     if quick:

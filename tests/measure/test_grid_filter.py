@@ -89,7 +89,7 @@ def brute_exclude(base, exclusion, radius, crossing, soft, rounds, present=(1, 1
 
 def test_exclusion_is_the_sum_over_the_other_hand():
     base = beliefs(3).square()
-    found = exclude(base, 2.5, 1.4, 2.8, 0.9, rounds=2)
+    found = exclude(base, 2.5, 1.4, 2.8, 0.9, torch.ones(2, 2), rounds=2)
     for n in range(2):
         expected = brute_exclude(base[n].double().numpy(), 2.5, 1.4, 2.8, 0.9, 2)
         np.testing.assert_allclose(found[n], expected, atol=2e-6)
@@ -108,7 +108,7 @@ def test_a_hand_excludes_the_other_as_far_as_it_is_visible():
 def test_two_hands_do_not_take_one_place():
     peak = torch.full((1, 2, 20, 30), 1e-4)
     peak[:, :, 10, 8], peak[:, :, 10, 22] = 1.0, 0.8
-    found = exclude(peak, 2.5, 3.0, 2.8, 1.5)
+    found = exclude(peak, 2.5, 3.0, 2.8, 1.5, torch.ones(1, 2))
     assert found[0, 0, 10, 22] > 0.8 and found[0, 1, 10, 8] > 0.8  # the left hand is on the right
 
 

@@ -19,6 +19,11 @@ from torchpose.upper_body._multiple_models import _averaged
 
 BOTH = ("window-mixture", "articulated")
 FEW = ("head", "neck", "hand_left", "hand_right")
+INFERRED = [
+    UPPER_BODY.index(f"{kind}_{side}")
+    for kind in ("shoulder", "elbow")
+    for side in ("left", "right")
+]
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +47,16 @@ def tracked(prior, keypoints, method, names=FEW, camera=CAMERA, **options):
 
 def shares(prior, keypoints, names=FEW, camera=CAMERA, **options):
     """Return the weight of windows in each frame [T], and how far joints are from that average."""
-    args = prior, keypoints
-    mixed = tracked(*args, "multiple-model", names, camera, **options).joints3d[0].flatten(1)
-    windows, bones = (
-        tracked(*args, m, names, camera, **options).joints3d[0].flatten(1) for m in BOTH
-    )
-    if options.get("smoothing") is not None:  # half of them without later frames
-        options["smoothing"] = None
-        causal = tracked(*args, BOTH[0], names, camera, **options).joints3d[0].flatten(1)
-        windows = (windows + causal) / 2
+
+    def joints(method, rows=slice(None), **options):
+        track = tracked(prior, keypoints, method, names, camera, **options)
+        return track.joints3d[0][:, rows].flatten(1)
+
+    if options.get("smoothing") is None:
+        mixed, windows, bones = (joints(m, **options) for m in ("multiple-model", *BOTH))
+    else:  # half of the windows without later frames; then hands are put on their rays
+        mixed, later, bones = (joints(m, INFERRED, **options) for m in ("multiple-model", *BOTH))
+        windows = (later + joints(BOTH[0], INFERRED, **(options | {"smoothing": None}))) / 2
     apart = windows - bones
     share = ((mixed - bones) * apart).sum(1) / apart.square().sum(1)
     return share, (bones + share[:, None] * apart - mixed).abs().max()
@@ -59,8 +65,7 @@ def shares(prior, keypoints, names=FEW, camera=CAMERA, **options):
 @pytest.mark.parametrize("smoothing", [None, 20, "full"])
 def test_poses_are_the_average_of_both_methods(prior, smoothing):
     share, off = shares(prior, of_stranger(), smoothing=smoothing, steady=False)
-    # hands are put on their rays once both kinds of windows are averaged
-    assert float(off) < (1e-9 if smoothing is None else 1e-3)
+    assert float(off) < 1e-9
     assert bool(((share > 0) & (share < 1)).all())
 
 
@@ -137,7 +142,7 @@ def test_smoothed_odds_rest_on_what_was_predicted_before_and_after(prior):
     ratios[1:] -= math.exp(-1 / 120) * sums[:-1]
     both = [discounted(x) + discounted(x.flip(0)).flip(0) - x for x in (ratios, counts)]
     expected = torch.sigmoid(0.5 + 0.5 * both[0] / both[1])
-    torch.testing.assert_close(smoothed, expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(smoothed, expected, atol=1e-6, rtol=0)
 
 
 def test_frames_without_arms_leave_the_odds(prior):

@@ -121,7 +121,7 @@ def exclude(
     radius: float,
     crossing: float,
     soft: float,
-    present: Float[Tensor, "N 2"] | None = None,
+    present: Float[Tensor, "N 2"],
     rounds: int = 2,
 ) -> Float[Tensor, "N 2 h w"]:
     """Return the beliefs of the left and the right hand after mutual exclusion.
@@ -134,7 +134,7 @@ def exclude(
 
     Args:
         base: beliefs before, any scale. exclusion: X. crossing: C. radius, soft: cells.
-        present: v, the probability that each hand is visible; None is 1.
+        present: v, the probability that each hand is visible.
         rounds: of messages from each hand to the other.
     """
     base = (base / base.sum((2, 3), keepdim=True).clamp_min(1e-30)).clamp_min_(_LEAST)
@@ -142,10 +142,8 @@ def exclude(
     belief = list(hands)
     for turn in range(2 * rounds):  # one hand after the other: both at once would oscillate
         k = turn % 2
-        taken, wrong = _occupied(belief[1 - k], k, radius, soft)
-        if present is not None:
-            there = present[:, 1 - k, None, None]
-            taken, wrong = taken.mul_(there), wrong.mul_(there)
+        there = present[:, 1 - k, None, None]
+        taken, wrong = (x.mul_(there) for x in _occupied(belief[1 - k], k, radius, soft))
         free = taken.mul_(math.expm1(-exclusion)).add_(1)
         belief[k] = hands[k] * free.mul_(wrong.mul_(math.expm1(-crossing)).add_(1))
     both = torch.stack(belief, 1)

@@ -335,13 +335,12 @@ class HandTracker(nn.Module):
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()
-        exclusion, crossing, present = s.exclusion, s.crossing, None
+        exclusion, crossing = s.exclusion, s.crossing
         if self.network is not None:
             exclusion, crossing = s.exclusion_beside_network, s.crossing_beside_network
-            present = 1 - state.gone
         return exclude(
             predicted * weight, exclusion, s.exclusion_radius / CELL,
-            crossing, s.crossing_soft / CELL, present,
+            crossing, s.crossing_soft / CELL, 1 - state.gone,
         )  # fmt: skip
 
     def _measure(
