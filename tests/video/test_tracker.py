@@ -11,6 +11,7 @@ from torchpose import VideoTracker, load_prior
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.priors import UpperBodyPrior
+from torchpose.upper_body._keypoint_files import TrackSettings
 
 pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
 FACE = 3  # the head, in `UPPER_BODY`
@@ -53,6 +54,8 @@ def test_bones_alone_track_unless_the_prior_knows_others():
     assert VideoTracker(shipped, demo_camera()).tracker.method == "articulated"
     assert VideoTracker(shipped, demo_camera(), smoothing="full").smoother.method == "articulated"
     assert VideoTracker(shipped, demo_camera(), height=1.7).tracker.method == "articulated"
+    as_typed = TrackSettings().tracker_options()  # of the command without any
+    assert VideoTracker(shipped, demo_camera(), **as_typed).tracker.method == "articulated"
     assert VideoTracker(shipped, demo_camera(), steady=True).tracker.method == "window-mixture"
     named = VideoTracker(shipped, demo_camera(), method="multiple-model")
     assert named.tracker.method == "multiple-model"

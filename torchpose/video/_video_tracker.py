@@ -370,9 +370,10 @@ def _keypoint_measurer(
 def _method_of(prior: UpperBodyPrior, options: TrackerOptions) -> str | None:
     """Return bones alone where these know everybody that the prior knows, else None for the usual choice."""
     of_others = {"window", "steady", *MethodOptions.__annotations__} - set(method_options(BONES))
+    given = {name for name, value in options.items() if value is not None}
     persons = set(prior.info.persons)
     known = bool(persons) and persons <= set(shipped_arm_prior().info.persons)
-    return BONES if known and of_others.isdisjoint(options) else None
+    return BONES if known and of_others.isdisjoint(given) else None
 
 
 def _refuse_measurer(**given: bool) -> None:
