@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from jsonargparse import ActionConfigFile, ArgumentParser
 
 from torchpose.cli._options import REQUIRED, Option, options_of, summary_of
+from torchpose.errors import InputError
 
 __all__ = ["Command", "Given", "add_options", "new_parser", "parse_seed"]
 
@@ -53,6 +54,16 @@ class Given(NamedTuple):
         given = [value for key, value in self.values.items() if key != output]
         words = [w for value in given for w in (value if isinstance(value, list) else [value])]
         return [Path(word) for word in words if isinstance(word, str) and _is_file(word)]
+
+    def refuse(self, keys: Iterable[str], why: str) -> None:
+        """Raise `InputError` for the first of some options that is given.
+
+        Args:
+            keys: of the options. why: what they are for, and what is there in its place.
+        """
+        for key in keys:
+            if self.values[key] != self.defaults[key]:
+                raise InputError(f"--{key.replace('_', '-')} is for {why}; leave it out")
 
     def line(self, out: str | Path) -> str:
         """Return a command over recordings with every option that differs from its default.

@@ -134,6 +134,7 @@ def run(
         from torchpose.cli._track_video import track_video
 
         return track_video(job, video, face_model, overlay)
+    given.refuse((*video, "face_model", "overlay"), f"videos, and {input} holds keypoints")
     return track_keypoints(job)
 
 

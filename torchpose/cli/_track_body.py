@@ -3,7 +3,6 @@
 import sys
 import time
 from argparse import ArgumentError
-from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -321,7 +320,7 @@ def _refuse_others(given: Given, by_keypoints: bool) -> None:
             "videos, or --detector, which finds them"
         )
     if not by_keypoints:
-        _refuse(given, _OF_KEYPOINTS, "keypoints, and the inputs are videos without --detector")
+        given.refuse(_OF_KEYPOINTS, "keypoints, and the inputs are videos without --detector")
     else:
         _refuse_beside_keypoints(given, method)
     kalman = by_keypoints and not _of_particles(method)
@@ -339,23 +338,23 @@ def _refuse_others(given: Given, by_keypoints: bool) -> None:
 
 def _refuse_beside_keypoints(given: Given, method: str | None) -> None:
     """Raise `InputError` for options of silhouettes, or of another method than keypoints are tracked by."""
-    _refuse(
-        given, ("facing",),
+    given.refuse(
+        ("facing",),
         "silhouettes of videos, and where keypoints are given the first pose is found in these",
     )  # fmt: skip
     if given.values["silhouettes"]:
         _check_silhouettes(given.values, method)
     else:
-        _refuse(
-            given, _HOW_SILHOUETTES,
+        given.refuse(
+            _HOW_SILHOUETTES,
             "silhouettes of videos, which are not computed beside keypoints without --silhouettes true",
         )  # fmt: skip
     if _of_particles(method):
-        _refuse(given, _OF_KALMAN, f"{KALMAN}, and --method {method} is given")
+        given.refuse(_OF_KALMAN, f"{KALMAN}, and --method {method} is given")
     else:
         options = (*_OF_PARTICLES, *(option.key for option in _method_options()))
         taken = f"particle filters, and keypoints are tracked by {KALMAN} without another --method"
-        _refuse(given, options, taken)
+        given.refuse(options, taken)
     if given.values["detector"] is None and given.values["min_confidence"] is not None:
         raise InputError(
             "--min-confidence is for --detector; confidences of files count as they are"
@@ -372,17 +371,6 @@ def _check_silhouettes(values: dict[str, Any], method: str | None) -> None:
         raise InputError(
             "--silhouettes true needs the videos of all cameras, by --videos, or as inputs of --detector"
         )
-
-
-def _refuse(given: Given, keys: Iterable[str], why: str) -> None:
-    """Raise `InputError` for the first of some options that is given.
-
-    Args:
-        given: the command. keys: of the options. why: what they are for, and what is there in its place.
-    """
-    for key in keys:
-        if given.values[key] != given.defaults[key]:
-            raise InputError(f"--{key.replace('_', '-')} is for {why}; leave it out")
 
 
 def _check(values: dict[str, Any]) -> None:
