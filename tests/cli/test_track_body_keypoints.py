@@ -97,6 +97,30 @@ def scene(tmp_path_factory):
     return folder, joints, points
 
 
+def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
+    folder, _, points = scene
+    cameras = list(load_cameras(folder / "cameras.toml").values())[:2]
+    for name in ("whole", "cut", "elsewhere"):
+        write_openpose(tmp_path / name, points[:, 0].numpy())
+    for path in sorted((tmp_path / "cut").iterdir())[:3]:
+        path.unlink()
+    for t, path in enumerate(sorted((tmp_path / "elsewhere").iterdir())):
+        path.rename(path.with_name(f"video_{5000 + t:012d}_keypoints.json"))
+
+    def read(*names):
+        return read_body_keypoints([str(tmp_path / name) for name in names], cameras)
+
+    found = read("whole", "cut")
+    assert len(found.points) == N
+    assert found.points[:3, 1].isnan().all() and not found.confidence[:3, 1].any()
+    torch.testing.assert_close(found.points[3:, 1], found.points[3:, 0], equal_nan=True)
+    assert any("numbers 0, 3; frames of one number are taken as simult" in n for n in found.notes)
+    found = read("whole", "elsewhere")
+    torch.testing.assert_close(found.points[:, 1], found.points[:, 0], equal_nan=True)
+    assert any("numbers 0, 5000; they are taken as simultaneous" in note for note in found.notes)
+    assert any("frame 0 is number 5000" in note for note in read("elsewhere", "elsewhere").notes)
+
+
 @pytest.fixture
 def track(torchpose, scene):
     """The command on files of the scene: track("front_json", ..., "--option") -> Result."""

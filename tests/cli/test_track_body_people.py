@@ -155,8 +155,9 @@ class crowd(front):
 
 def test_everybody_in_openpose_files(scene):
     folder = scene[0] / "front_json"
-    points, confidence, names = read_openpose_people(folder)
-    assert points.shape == (N, 2, 25, 2) and len(names) == 25
+    people = read_openpose_people(folder)
+    points, confidence = people.keypoints, people.confidence
+    assert points.shape == (N, 2, 25, 2) and len(people.names) == 25
     assert (confidence > 0).any(-1).sum(-1).tolist() == [1] * ENTERS + [2] * (N - ENTERS)
     assert np.isnan(points[:ENTERS, 1]).all()
     assert read_keypoints(folder).n_people.tolist() == [1] * ENTERS + [2] * (N - ENTERS)

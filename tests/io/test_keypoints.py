@@ -58,6 +58,29 @@ def test_npz(tmp_path):
     np.testing.assert_array_equal(read.keypoints[0], given_points[0])
 
 
+def test_coordinates_that_are_no_pixels(tmp_path):
+    shares = points() / 640
+    with pytest.raises(FileFormatError, match=r"must be in pixels.*width and height"):
+        read_keypoints(write(tmp_path / "a.npz", keypoints=shares))
+    assert (
+        len(read_keypoints(write(tmp_path / "b.npz", keypoints=shares[:1]))) == 1
+    )  # too few to tell
+
+
+def test_zeros_are_missing(tmp_path):
+    zeros = points()
+    zeros[2, 1] = 0
+    read = read_keypoints(write(tmp_path / "a.npz", keypoints=zeros))
+    assert (~read.measured).nonzero().tolist() == [[2, 1]]
+    assert read.notes == ("1 keypoints at exactly (0, 0) count as missing",)
+    confidence = np.where((zeros == 0).all(-1), 0.0, 1.0)
+    assert not read_keypoints(
+        write(tmp_path / "b.npz", keypoints=zeros, confidence=confidence)
+    ).notes
+    with pytest.raises(InputError, match="no keypoint is measured"):
+        read_keypoints(write(tmp_path / "c.npz", keypoints=np.zeros((5, 3, 2))))
+
+
 def test_only_what_must_be_there(tmp_path):
     read = read_keypoints(write(tmp_path / "a.npz", keypoints=points().astype(np.float32)))
     assert (read.confidence, read.fps, read.K, read.image_size, read.neck) == (None,) * 5
@@ -65,7 +88,9 @@ def test_only_what_must_be_there(tmp_path):
 
 def test_the_neck_of_a_known_set(tmp_path):
     names = SKELETONS["openpose-18"].joints
-    path = write(tmp_path / "a.npz", keypoints=np.ones((2, 18, 2)), names=np.array(names))
+    path = write(
+        tmp_path / "a.npz", keypoints=100 + np.arange(72.0).reshape(2, 18, 2), names=np.array(names)
+    )
     assert read_keypoints(path).neck == "mid-shoulder"
 
 
@@ -130,7 +155,8 @@ COORDINATE = st.floats(-1e4, 1e4) | st.just(math.nan)
 )
 def test_what_is_written_reads_back(tmp_path, values, scored, suffix):
     given_points = torch.tensor(values, dtype=torch.float64).reshape(-1, 3, 2)
-    given_points[0, 0] = 1.0
+    given_points[0, 0] = 100.0
+    given_points[(given_points == 0).all(-1)] = math.nan  # which files have where nothing was found
     measured = torch.isfinite(given_points).all(-1)
     given_points[~measured] = math.nan
     confidence = torch.where(measured, 0.7, 0.0).double() if scored else None
@@ -149,7 +175,7 @@ def test_what_is_written_reads_back(tmp_path, values, scored, suffix):
 
 def test_writing_keeps_the_camera(tmp_path):
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
-    data = Keypoints(torch.ones(2, 3, 2).double(), NAMES, K=K, neck="neck")
+    data = Keypoints(torch.full((2, 3, 2), 100.0).double(), NAMES, K=K, neck="neck")
     write_keypoints(tmp_path / "a.npz", data)
     back = read_keypoints(tmp_path / "a.npz")
     assert back.K is not None
@@ -315,7 +341,8 @@ def test_files_without_numbers_and_old_key(tmp_path):
     folder = tmp_path / "json"
     frame(folder, "b", {"pose_keypoints": person(2)["pose_keypoints_2d"]})
     frame(folder, "a", {"pose_keypoints": person(1)["pose_keypoints_2d"]})
-    assert read_keypoints(folder).keypoints[:, 0, 0].tolist() == [1, 2]
+    read = read_keypoints(folder)
+    assert read.keypoints[:, 0, 0].tolist() == [1, 2] and read.first_frame == 0
 
 
 def test_bad_openpose_folders(tmp_path):

@@ -49,6 +49,7 @@ class CameraKeypoints(NamedTuple):
         confidence: [T, D, 15].
         fps, size: of the images, (width, height), None if unknown. notes: of the reader.
         n_people: how many people the frames show [T], where one of them is followed.
+        first: the number that the input gives to the first frame; None if it numbers none.
     """
 
     points: Tensor
@@ -57,6 +58,20 @@ class CameraKeypoints(NamedTuple):
     size: tuple[int, int] | None
     notes: tuple[str, ...] = ()
     n_people: Tensor | None = None
+    first: int | None = None
+
+    def after(self, n_frames: int) -> "CameraKeypoints":
+        """Return the keypoints after some frames without any."""
+        if not n_frames:
+            return self
+        points, confidence = (
+            torch.cat([value.new_full((n_frames, *value.shape[1:]), missing), value])
+            for value, missing in ((self.points, torch.nan), (self.confidence, 0.0))
+        )
+        n_people = self.n_people
+        if n_people is not None:
+            n_people = torch.cat([n_people.new_zeros(n_frames), n_people])
+        return self._replace(points=points, confidence=confidence, n_people=n_people)
 
 
 class BodyKeypoints(NamedTuple):
@@ -132,8 +147,9 @@ def read_body_keypoints(
     ]
     rates = [part.fps for part in parts if part.fps is not None] or list(other_rates)
     rate, notes = common_rate(rates, fps)
+    parts, numbered = _by_number(parts, inputs)
     points, confidence, more = _in_step(parts, delays or [0] * len(parts), inputs)
-    notes += more + tuple(note for _, found in fitted for note in found)
+    notes += numbered + more + tuple(note for _, found in fitted for note in found)
     notes += tuple(
         f"{path}: {n}" for path, part in zip(inputs, parts, strict=True) for n in part.notes
     )
@@ -175,6 +191,28 @@ def common_rate(rates: Sequence[float], given: float | None) -> tuple[float, tup
     if not known:
         return _FPS, (f"no input states a frame rate: {_FPS:g} fps assumed, --fps says another",)
     return rates[0], ()
+
+
+def _by_number(
+    parts: list[CameraKeypoints], inputs: Sequence[str]
+) -> tuple[list[CameraKeypoints], tuple[str, ...]]:
+    """Return the keypoints with frames of one number side by side, and a note where that is to be said.
+
+    Numbers count where all inputs are of one kind and have most of them in common: another kind of file, or
+    another cut of a video, may count from elsewhere.
+    """
+    firsts = [part.first or 0 for part in parts]
+    begin = min(firsts)
+    if len(set(firsts)) == 1:
+        return parts, (f"frame 0 is number {begin} of the files",) * (begin > 0)
+    said = f"the first frames of the inputs have the numbers {', '.join(map(str, firsts))}"
+    one_kind = len({Path(path).suffix.lower() for path in inputs}) == 1
+    lengths = [len(part.points) for part in parts]
+    shared = min(map(sum, zip(firsts, lengths, strict=True))) - max(firsts)
+    if not one_kind or 2 * shared < min(lengths):
+        return parts, (f"{said}; they are taken as simultaneous",)
+    moved = [part.after(first - begin) for part, first in zip(parts, firsts, strict=True)]
+    return moved, (f"{said}; frames of one number are taken as simultaneous, 0 is number {begin}",)
 
 
 def _in_step(
@@ -220,15 +258,18 @@ def _read(
     from torchpose.io._keypoints import read_keypoints
 
     if everybody and Path(path).is_dir():
-        table, trust, names = read_openpose_people(path)
-        of_body = _of_body(path, torch.from_numpy(table), torch.from_numpy(trust), names)
-        return CameraKeypoints(*of_body, None, None)
+        people = read_openpose_people(path)
+        table, trust = (torch.from_numpy(value) for value in (people.keypoints, people.confidence))
+        of_body = _of_body(path, table, trust, people.names)
+        return CameraKeypoints(*of_body, None, None, first=people.first)
     found = read_keypoints(path)
     points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
-    notes = found.notes if count_given(found.names) == len(found.names) else ()
+    derived = count_given(found.names) < len(found.names)  # joints that are not used here
+    notes = found.notes[:-1] if derived else found.notes
     return CameraKeypoints(
-        points[:, None], confidence[:, None], found.fps, found.image_size, notes, found.n_people
-    )
+        points[:, None], confidence[:, None], found.fps, found.image_size, notes, found.n_people,
+        found.first_frame,
+    )  # fmt: skip
 
 
 def _of_body(

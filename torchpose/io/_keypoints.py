@@ -33,6 +33,8 @@ __all__ = ["Keypoints", "read_keypoints", "write_keypoints"]
 
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
+_NORMALISED = 2.0  # no more are shares of the image, in which joints may lie outside
+_SEVERAL = 6  # keypoints
 
 
 @dataclass
@@ -50,6 +52,7 @@ class Keypoints:
         path: the file or folder.
         notes: sentences on conversions of the file's keypoints.
         n_people: how many people are in each frame [T], of whom one is followed; None if the file holds one.
+        first_frame: the number that the file gives to the first frame; None if it numbers none.
     """
 
     keypoints: Tensor
@@ -62,6 +65,7 @@ class Keypoints:
     path: Path | None = None
     notes: tuple[str, ...] = ()
     n_people: Tensor | None = None
+    first_frame: int | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -106,8 +110,14 @@ def read_keypoints(path: str | Path) -> Keypoints:
 
 def _read(path: Path) -> RawKeypoints:
     if os.path.isdir(path):
-        points, confidence, names, n_people = read_openpose(path)
-        return RawKeypoints(points, names, confidence, n_people=n_people)
+        found = read_openpose(path)
+        return RawKeypoints(
+            found.keypoints,
+            found.names,
+            found.confidence,
+            n_people=found.n_people,
+            first_frame=found.first,
+        )
     path = require_file(path)
     readers = {".npz": read_npz_keypoints, ".csv": read_csv_keypoints}
     if path.suffix.lower() not in readers:
@@ -190,13 +200,16 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         canonical_names(names)
     except SkeletonError as error:
         raise SkeletonError(f"{path}: {error}") from error
-    missing = np.isnan(points).any(-1)
+    filled = (points == 0).all(-1)  # what many files have where nothing was found
+    missing = np.isnan(points).any(-1) | filled
     if raw.confidence is not None:
         confidence = _check_confidence(path, raw.confidence, points.shape[:2])
+        filled &= confidence > 0
         missing |= confidence == 0
         confidence = np.where(missing, 0.0, confidence)
     if missing.all():
         raise InputError(f"{path}: no keypoint is measured in any of {len(points)} frames")
+    _check_pixels(path, points[~missing])
     try:
         fps = None if raw.fps is None else check_rate("fps", raw.fps)
     except InputError as error:
@@ -211,7 +224,9 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         None if raw.confidence is None else torch.from_numpy(confidence), fps,
         _check_matrix(path, raw.K), _check_size(path, raw.image_size),
         raw.neck or (None if skeleton is None else skeleton.neck), path,
+        notes=_note_of_filled(int(filled.sum())),
         n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
+        first_frame=raw.first_frame,
     )  # fmt: skip
     return _with_joints(keypoints) if lacks_joints(names) else keypoints
 
@@ -225,9 +240,23 @@ def _with_joints(data: Keypoints) -> Keypoints:
         "head, neck and hands are put where the prior's are, from MediaPipe's ears, shoulders, "
         "wrists and index fingers"
     )
+    notes = (*data.notes, note)
     return replace(
-        data, keypoints=points, confidence=confidence, names=names, neck="neck", notes=(note,)
+        data, keypoints=points, confidence=confidence, names=names, neck="neck", notes=notes
     )
+
+
+def _check_pixels(path: Path, points: np.ndarray) -> None:
+    """Refuse keypoints [N, 2] that are no pixels, such as those between 0 and 1."""
+    if len(points) >= _SEVERAL and np.abs(points).max() <= _NORMALISED:
+        raise FileFormatError(
+            f"{path}: keypoints must be in pixels, got all of them between {points.min():.3g} and "
+            f"{points.max():.3g}; multiply those between 0 and 1 by the width and height of the image"
+        )
+
+
+def _note_of_filled(count: int) -> tuple[str, ...]:
+    return (f"{count} keypoints at exactly (0, 0) count as missing",) * (count > 0)
 
 
 def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -36,6 +36,7 @@ class RawKeypoints:
     image_size: np.ndarray | Sequence[float] | None = None
     neck: str | None = None
     n_people: np.ndarray | None = None
+    first_frame: int | None = None
 
 
 def read_npz_keypoints(path: Path) -> RawKeypoints:
@@ -95,7 +96,7 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
         )
     table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
     table = table.reshape(-1, len(header))
-    index, count = _frames(path, table[:, 0], rows, repeated=False)
+    index, count, first = _frames(path, table[:, 0], rows, repeated=False)
     joints = np.stack([table[:, [column[f"{n}_{a}"] for n in names]] for a in "xy"], -1)
     points = np.full((count, len(names), 2), np.nan)
     points[index] = joints
@@ -105,7 +106,7 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
         for j, name in enumerate(names):
             given = column.get(f"{name}_confidence")
             confidence[index, j] = 1.0 if given is None else table[:, given]
-    return RawKeypoints(points, tuple(names), confidence)
+    return RawKeypoints(points, tuple(names), confidence, first_frame=first)
 
 
 def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
@@ -115,7 +116,7 @@ def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     names = list(dict.fromkeys(cells[1] for _, cells in rows))
     table = np.array([[_cell(path, number, c) for c in (cells[0], *cells[2:])]
                       for number, cells in rows]).reshape(-1, 3 + scored)  # fmt: skip
-    index, count = _frames(path, table[:, 0], rows, repeated=True)
+    index, count, first = _frames(path, table[:, 0], rows, repeated=True)
     joint = np.array([names.index(cells[1]) for _, cells in rows], dtype=int)
     if len(set(zip(index.tolist(), joint.tolist(), strict=True))) < len(rows):
         raise FileFormatError(
@@ -127,7 +128,7 @@ def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     if scored:
         confidence = np.zeros((count, len(names)))
         confidence[index, joint] = table[:, 3]
-    return RawKeypoints(points, tuple(names), confidence)
+    return RawKeypoints(points, tuple(names), confidence, first_frame=first)
 
 
 def _cell(path: Path, number: int, cell: str) -> float:
@@ -141,8 +142,8 @@ def _cell(path: Path, number: int, cell: str) -> float:
 
 def _frames(
     path: Path, frames: np.ndarray, rows: list[tuple[int, list[str]]], repeated: bool
-) -> tuple[np.ndarray, int]:
-    """Return the row -> index of its frame, counted from the first one, and the number of frames."""
+) -> tuple[np.ndarray, int, int]:
+    """Return the index of each row's frame, counted from the first, the number of frames, and the first."""
     with np.errstate(invalid="ignore"):  # of infinite ones
         whole = np.isfinite(frames) & (frames % 1 == 0)
         steps = np.diff(frames, prepend=frames[:1] - (not repeated))
@@ -156,7 +157,7 @@ def _frames(
     index = (frames - frames[:1]).astype(int)
     count = int(index[-1]) + 1 if len(index) else 0
     check_span(path, count, len(np.unique(index)))
-    return index, count
+    return index, count, int(frames[0]) if count else 0
 
 
 def _csv_notes(path: Path, notes: list[str]) -> tuple[float | None, list[float] | None]:

@@ -9,6 +9,7 @@ confidence. An empty list of people is a frame without measurements.
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from torchpose._core.reading import check_span, read_json, reading
 from torchpose.errors import FileFormatError, InputError
 from torchpose.skeleton._joint_sets import SKELETONS
 
-__all__ = ["read_openpose", "read_openpose_people"]
+__all__ = ["OpenPosePeople", "OpenPosePerson", "read_openpose", "read_openpose_people"]
 
 _SUFFIX = "_keypoints.json"
 _LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
@@ -31,9 +32,37 @@ _EXPECTED = "OpenPose's JSON with people / pose_keypoints_2d"
 _FAR = 1e9  # pixels; no keypoint is there
 
 
-def read_openpose(
-    folder: str | Path,
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
+class OpenPosePerson(NamedTuple):
+    """Holds the keypoints of one person who was followed.
+
+    Attributes:
+        keypoints: [T, J, 2], pixels, NaN where missing. confidence: [T, J].
+        names: of BODY_25, BODY_25B or COCO 18, whichever the files hold.
+        n_people: how many people are in each frame [T]. first: number of the first file.
+    """
+
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    names: tuple[str, ...]
+    n_people: np.ndarray
+    first: int
+
+
+class OpenPosePeople(NamedTuple):
+    """Holds the keypoints of everybody.
+
+    Attributes:
+        keypoints: [T, D, J, 2] of the up to D people of each frame, in the order of the file, NaN where
+            there are fewer. confidence: [T, D, J]. names: as of one person. first: number of the first file.
+    """
+
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    names: tuple[str, ...]
+    first: int
+
+
+def read_openpose(folder: str | Path) -> OpenPosePerson:
     """Read a folder of OpenPose JSON files, and follow one person.
 
     The number in front of ``_keypoints.json`` is the frame; frames without a file are missing.
@@ -42,54 +71,52 @@ def read_openpose(
         folder: the folder.
 
     Returns:
-        keypoints [T, J, 2], pixels, NaN where missing; confidence [T, J]; the J names of BODY_25,
-        BODY_25B or COCO 18, whichever the files hold; how many people are in each frame [T]. BODY_25B has as
-        many keypoints as BODY_25 in another order; where the necks and hips are tells which it is.
+        `OpenPosePerson`. BODY_25B has as many keypoints as BODY_25 in another order; where the necks and
+        hips are tells which it is.
 
     Raises:
         InputError: no such files, or nobody in any of them. FileFormatError: not OpenPose's JSON,
             or another number of keypoints; the file is named.
     """
-    frames, names = _read_frames(folder)
+    frames, names, first = _read_frames(folder)
     table = np.zeros((len(frames), len(names), 3))
     followed = None
     for row, group in enumerate(frames):
         if group:
             followed = _pick(np.stack(group), followed)
             table[row] = followed
-    return *_measured(table), names, np.array([len(group) for group in frames])
+    n_people = np.array([len(group) for group in frames])
+    return OpenPosePerson(*_measured(table), names, n_people, first)
 
 
-def read_openpose_people(
-    folder: str | Path,
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+def read_openpose_people(folder: str | Path) -> OpenPosePeople:
     """Read the keypoints of everybody in a folder of OpenPose JSON files.
 
     Args:
         folder: the folder.
 
     Returns:
-        keypoints [T, D, J, 2] of the up to D people of each frame, in the order of the file, NaN where there
-        are fewer; confidence [T, D, J]; the J names. An index says nothing about who it is.
+        `OpenPosePeople`. An index says nothing about who it is.
 
     Raises:
         InputError, FileFormatError: as `read_openpose`.
     """
-    frames, names = _read_frames(folder)
+    frames, names, first = _read_frames(folder)
     table = np.zeros((len(frames), max(map(len, frames)), len(names), 3))
     for row, group in enumerate(frames):
         if group:
             table[row, : len(group)] = np.stack(group)
-    return *_measured(table), names
+    return OpenPosePeople(*_measured(table), names, first)
 
 
-def _read_frames(folder: str | Path) -> tuple[list[list[np.ndarray]], tuple[str, ...]]:
-    """Return the keypoints [J, 3] of the people of every frame, and the J names."""
+def _read_frames(folder: str | Path) -> tuple[list[list[np.ndarray]], tuple[str, ...], int]:
+    """Return the keypoints [J, 3] of the people of every frame, the J names, and the first number."""
     files = _files_by_frame(Path(folder))
     people = {frame: _people(path) for frame, path in files.items()}
     everybody = [person for group in people.values() for person in group]
     names = _layout(folder, everybody, len(files))
-    return [people.get(frame, []) for frame in range(min(files), max(files) + 1)], names
+    first = min(files)
+    return [people.get(frame, []) for frame in range(first, max(files) + 1)], names, first
 
 
 def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) -> tuple[str, ...]:
