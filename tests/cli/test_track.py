@@ -1,6 +1,7 @@
 """`torchpose track`: files, options, cameras, and what it refuses."""
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.cli import _track_output as track_output
 from torchpose.io import read_keypoints, write_keypoints
 from torchpose.priors import load_prior
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton import SKELETONS, UPPER_BODY
 from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
 
 SMALL = "kinect-upper-body-small"  # a prior with windows
@@ -260,6 +261,56 @@ def test_help_lists_every_method(torchpose):
     assert all(method in text for method in METHODS)
 
 
+# --- doubts ---------------------------------------------------------------------------------------
+
+
+def test_keypoints_that_count_upwards_are_noted(track, files, tmp_path):
+    clip = keypoints()
+    clip.keypoints[..., 1] = 480 - clip.keypoints[..., 1]
+    shoulders = clip.keypoints[:, :2] + torch.tensor([[-40.0, -30.0], [40.0, -90.0]])
+    names = (*clip.names, "shoulder_left", "shoulder_right")
+    more = torch.cat([clip.keypoints, shoulders], 1)
+    write_keypoints(tmp_path / "up.npz", replace(clip, keypoints=more, names=names))
+    assert "rows of pixels count downwards" in track(clip=tmp_path / "up.npz")[0].out
+    assert "downwards" not in track()[0].out
+
+
+def test_several_people_and_numbers_of_files_are_noted(track, files, tmp_path):
+    clip = keypoints()
+    rows = clip.keypoints.nan_to_num(0)
+    for t, points in enumerate(rows):
+        table = torch.zeros(18, 3)
+        for joint, name in (("Neck", "neck"), ("LWrist", "hand_left"), ("RWrist", "hand_right")):
+            at = SKELETONS["openpose-18"].joints.index(joint)
+            table[at, :2], table[at, 2] = points[clip.names.index(name)], 0.9
+        people = [{"pose_keypoints_2d": table.flatten().tolist()}] * (2 if t == 7 else 1)
+        (tmp_path / f"clip_{100 + t:06d}_keypoints.json").write_text(json.dumps({"people": people}))
+    done, _ = track("--camera", "525,525,319.5,239.5", "--neck", "neck", clip=tmp_path)
+    assert "several people, up to 2, from frame 7 on" in done.out
+    assert "frame 0 is number 100" in done.out
+
+
+def test_keypoints_of_no_body_have_no_poses(torchpose, files, tmp_path):
+    clip = keypoints()
+    clip.keypoints[...] = 640 * torch.rand(clip.keypoints.shape, dtype=torch.float64)
+    write_keypoints(
+        tmp_path / "noise.npz", replace(clip, K=torch.diag(torch.tensor([11.0, 11, 1])).double())
+    )
+    prior = files / "prior.safetensors"
+    done = torchpose(
+        "track",
+        tmp_path / "noise.npz",
+        "--out",
+        tmp_path / "out",
+        "--prior",
+        prior,
+        "--pictures",
+        "false",
+    )
+    assert done.code == 1
+    assert "no keypoint was taken for a measurement" in done.err
+
+
 # --- refusals -------------------------------------------------------------------------------------
 
 PRIOR, CLIP = "{files}/prior.safetensors", "{files}/keypoints.npz"
@@ -296,8 +347,13 @@ BAD_INPUT = {
     "negative std": ([CLIP, "--measurement-std=-2"], "must be positive"),
     "three numbers": ([CLIP, "--camera", "1,2,3"], "fx,fy,cx,cy"),
     "no focal length": ([CLIP, "--camera", "0,0,320,240"], "positive focal lengths"),
+    "a camera in millimetres": ([CLIP, "--camera", "4.2,4.2,3,2"], "a camera must be in pixels"),
     "no camera file": ([CLIP, "--camera", "{tmp}/no.toml"], "no such file"),
     "camera of other images": ([CLIP, "--camera", "{tmp}/small.toml"], "320 x 240"),
+    "keypoints of another size": (["{tmp}/large.npz"], "lie outside the image of 640 x 480"),
+    "confidence of a detector": ([CLIP, "--min-confidence", "0.5"], "is for videos"),
+    "detector of keypoints": ([CLIP, "--detector", "no.onnx"], "is for videos"),
+    "no overlay of keypoints": ([CLIP, "--overlay", "false"], "is for videos"),
     "unknown frame": ([CLIP, "--frame", "world"], "'camera' or 'body'"),
     "unknown neck": ([CLIP, "--neck", "long"], "mid-shoulder"),
     "no nose": (["{tmp}/no_head.npz", "--nose-as-head", "true"], "needs a nose"),
@@ -318,6 +374,9 @@ def bad_files(tmp_path, files):
     (tmp_path / "key.yaml").write_text("speed: 9\n")
     whole = (files / "keypoints.npz").read_bytes()
     (tmp_path / "truncated.npz").write_bytes(whole[: len(whole) // 2])
+    large = keypoints()
+    large.keypoints[..., 0] += 500
+    write_keypoints(tmp_path / "large.npz", large)
     write_keypoints(tmp_path / "no_camera.npz", keypoints(K=None, image_size=None))
     knees = ("knee_left", "knee_right", "ankle_left", "ankle_right")
     write_keypoints(tmp_path / "knees.npz", keypoints(names=knees))

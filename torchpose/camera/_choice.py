@@ -15,6 +15,7 @@ from torchpose.errors import CameraError
 __all__ = ["fit_to_size", "is_padded", "resolve_camera"]
 
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
+_LEAST_FOCAL = 10.0  # pixels
 _SQUEEZED = 0.02  # of the ratio of the sides: images of another shape are cut, and not scaled
 
 
@@ -36,11 +37,11 @@ def resolve_camera(
         source: the input, for messages.
 
     Raises:
-        CameraError: no camera is known, four numbers are not what was given, or its image size is
-            not that of the input. InputError, FileFormatError: the file.
+        CameraError: no camera is known, four numbers are not what was given, its image size is not that
+            of the input, or its focal length is not one in pixels. InputError, FileFormatError: the file.
     """
     if given:
-        camera = _given_camera(given, name)
+        camera = _of_pixels(_given_camera(given, name), given)
         if size is not None and camera.image_size is not None and camera.image_size != size:
             raise CameraError(
                 f"{given}: the camera is for images of {_text(camera.image_size)}, the input is "
@@ -51,7 +52,7 @@ def resolve_camera(
             notes = ("the camera's distortions are not applied: undistort keypoints beforehand",)
         return camera, notes
     if matrix is not None:
-        return PinholeCamera.from_matrix(matrix, *(size or (None, None))), ()
+        return _of_pixels(PinholeCamera.from_matrix(matrix, *(size or (None, None))), source), ()
     if size is not None:
         camera = PinholeCamera.from_image_size(*size)
         focal = float(camera.matrix[0, 0])
@@ -75,6 +76,17 @@ def _given_camera(given: str, name: str | None) -> PinholeCamera:
             f"--camera must be a TOML file or four numbers fx,fy,cx,cy in pixels, got {given!r}"
         ) from error
     return PinholeCamera(fx, fy, cx, cy)
+
+
+def _of_pixels(camera: PinholeCamera, source: object) -> PinholeCamera:
+    """Return the camera if its focal lengths can be pixels."""
+    focal = float(camera.matrix.diagonal()[:2].min())
+    if focal < _LEAST_FOCAL:
+        raise CameraError(
+            f"{source}: a camera must be in pixels, got a focal length of {focal:g}; that of images of "
+            "640 x 480 is about 525"
+        )
+    return camera
 
 
 def _text(size: tuple[int, int]) -> str:

@@ -154,7 +154,14 @@ def _sample_size(track: "PoseTrack") -> list[str]:
 
 
 def report_failure(track: "PoseTrack") -> int:
-    """Return the exit code: 1, with a line on stderr, if the filter degenerated, else 0."""
+    """Return the exit code: 1, with a line on stderr, if the poses are of no use, else 0."""
+    if not bool(track.observed.any()):
+        print(
+            "torchpose: no keypoint was taken for a measurement, so the poses are the prior's: all of them "
+            "belong to no body. Check the camera, the units and the names of the keypoints",
+            file=sys.stderr,
+        )
+        return 1
     at = int(track.failed_at[0])
     if at < 0:
         return 0

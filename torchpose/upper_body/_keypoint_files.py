@@ -18,6 +18,7 @@ from torchpose.priors._upper_body_prior import load_prior
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._upper_body import NECK_KINDS
 from torchpose.upper_body._estimator_table import METHODS, WINDOWS, method_options, replace_window
+from torchpose.upper_body._keypoint_doubts import doubts_about, refuse_another_size
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
@@ -33,14 +34,15 @@ class TrackSettings:
     Args:
         prior: the name of a prior that comes with torchpose, or a .safetensors file.
         method: the name of an estimator; by default articulated if wrists are measured and the prior has
-            hands, else multiple-model if the prior has windows that suit, else articulated or mkf-fixed.
+            hands, else multiple-model if the prior has windows that suit, else articulated or mkf-fixed; in a
+            video, articulated if its prior over arms knows everybody whom the prior knows.
         camera: the camera: a TOML file, or four numbers fx,fy,cx,cy in pixels; by default K or the image
             size of the input.
         camera_name: the name of the camera in a file that has several.
         measurement_std: the standard deviation of a keypoint in pixels: one number, or five with commas
             for hand, elbow, shoulder, head, neck; by default as the prior learnt it, else 3.
-        smoothing: use this many later frames, or all of them ("full"), for each estimate; only with
-            articulated, window-mixture and mkf-fixed.
+        smoothing: use this many later frames, or all of them ("full"), for each estimate; with all but
+            mkf-sampled, mkf-split and the pf methods.
         n_particles: the number of particles of the pf methods (default 10000).
         n_tracks: the number of tracks of mkf-sampled and mkf-split.
         arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
@@ -222,6 +224,7 @@ class KeypointFileTracker:
             keypoints.K,
             keypoints.path,
         )
+        refuse_another_size(keypoints, keypoints.image_size or camera.image_size)
         names, more = _joint_names(keypoints, settings.nose_as_head)
         fps = settings.fps or keypoints.fps
         if fps is None:
@@ -233,7 +236,7 @@ class KeypointFileTracker:
             fps,
             _kind_of_neck(settings.neck, keypoints),
         )
-        notes += tuple(keypoints.notes) + more
+        notes += (*keypoints.notes, *doubts_about(keypoints), *more)
         return PreparedTracker(self._tracker(key, camera), camera, names, notes)
 
     @in_inference_mode

@@ -1,0 +1,65 @@
+"""Say what is doubtful about the keypoints of a file, and refuse those of images of another size."""
+
+from collections.abc import Iterator
+
+import torch
+
+from torchpose.errors import CameraError
+from torchpose.io._keypoints import Keypoints
+from torchpose.skeleton._joint_sets import canonical_names
+
+__all__ = ["doubts_about", "refuse_another_size"]
+
+_UPPER = ("head", "nose", "neck")
+_LOWER = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right", "hip_left", "hip_right")
+_TURNED = 0.8  # share of the frames in which what is above should not be below
+
+
+def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> None:
+    """Refuse keypoints most of which lie outside the image.
+
+    Args:
+        keypoints: of a file. size: (width, height) of the images, None if unknown.
+
+    Raises:
+        CameraError: they are of images of another size.
+    """
+    if size is None:
+        return
+    points = keypoints.keypoints[keypoints.measured]
+    outside = ((points < 0) | (points > points.new_tensor(size))).any(-1)
+    if 2 * int(outside.sum()) > len(points):
+        raise CameraError(
+            f"{keypoints.path}: {int(outside.sum())} of {len(points)} keypoints lie outside the image of "
+            f"{size[0]} x {size[1]} pixels; if they are of a video of another size, give its camera and "
+            "image_size"
+        )
+
+
+def doubts_about(keypoints: Keypoints) -> Iterator[str]:
+    """Yield a note on each doubt about the keypoints of a file."""
+    several = torch.zeros(0) if keypoints.n_people is None else keypoints.n_people > 1
+    if bool(several.any()) and keypoints.n_people is not None:
+        yield (
+            f"several people, up to {int(keypoints.n_people.max())}, from frame {int(several.nonzero()[0])} "
+            "on; one of them is tracked"
+        )
+    if keypoints.first_frame:
+        yield f"frame 0 is number {keypoints.first_frame} of the file"
+    if _upside_down(keypoints):
+        yield (
+            "head and neck lie below shoulders and elbows in most frames: rows of pixels count downwards, so "
+            "keypoints that count upwards have to be turned over"
+        )
+
+
+def _upside_down(keypoints: Keypoints) -> bool:
+    """Return whether what is above in people is below in most frames."""
+    names = canonical_names(keypoints.names)
+    above, below = ([names.index(n) for n in group if n in names] for group in (_UPPER, _LOWER))
+    if not above or not below:
+        return False
+    rows = keypoints.keypoints[..., 1]
+    gaps = rows[:, above].nanmean(1) - rows[:, below].nanmean(1)
+    known = gaps.isfinite()
+    return bool(known.any()) and float((gaps[known] > 0).double().mean()) > _TURNED
