@@ -329,6 +329,11 @@ def test_one_camera_needs_no_name(tmp_path):
         ("", FileFormatError, "none"),
         ("[metadata]\nerror = 0.0", FileFormatError, "none"),
         ("[cam]\nsize = [640, 480]", CameraError, r"\[cam\].*needs `matrix`"),
+        (
+            "[cam]\nmatrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\nrotation = [0, 0, 0]",
+            CameraError,
+            "needs `rotation` and `translation`",
+        ),
         ("[cam]\nmatrix = [[0, 0, 1], [0, 1, 1], [0, 0, 1]]", CameraError, r"\[cam\].*focal"),
         ("[cam]\nmatrix = [[1, 0, 1], [0, 1, 1]]", CameraError, "shape"),
         ("[cam]\nmatrix = 'K'", CameraError, "3 x 3"),

@@ -256,6 +256,11 @@ def test_config_file_round_trip(torchpose, files, tmp_path):
     )
 
 
+def test_smoothing_of_a_config_can_be_taken_back(track, files, tmp_path):
+    (tmp_path / "smooth.yaml").write_text("smoothing: full\n")
+    same(track("--config", tmp_path / "smooth.yaml", "--smoothing", "none")[1], expected(files))
+
+
 def test_help_lists_every_method(torchpose):
     text = "".join(torchpose("track", "--help").out.split())
     assert all(method in text for method in METHODS)
@@ -328,13 +333,17 @@ BAD_INPUT = {
     "no such prior": ([CLIP, "--prior", "nobody"], "expected the name of a prior"),
     "foreign prior": ([CLIP, "--prior", CLIP], "expected a prior as safetensors"),
     "unknown method": ([CLIP, "--method", "kf"], ", ".join(METHODS)),
-    "method has no particles": ([CLIP, "--n-particles", "9"], "does not apply"),
+    "method has no particles": ([CLIP, "--n-particles", "9"], "needs --method, one of pf"),
     "no particles": ([CLIP, "--method", "pf-walk", "--n-particles", "0"], "at least 1"),
     "option of another method": ([CLIP, "--method", "mkf-fixed", "--steady", "true"], "steady"),
-    "tracks of the default": ([CLIP, "--n-tracks", "9"], "it is of mkf-sampled, mkf-split"),
+    "tracks of the default": ([CLIP, "--n-tracks", "9"], "one of mkf-sampled, mkf-split"),
+    "tracks of another": (
+        [CLIP, "--method", "mkf-fixed", "--n-tracks", "9"],
+        "does not apply to --method mkf-fixed; it is of mkf-sampled",
+    ),
     "smoothing of particles": ([CLIP, "--method", "pf-walk", "--smoothing", "3"], "mkf-fixed"),
-    "bad smoothing": ([CLIP, "--smoothing", "half"], "a number of frames or 'full'"),
-    "negative smoothing": ([CLIP, "--smoothing", "-1"], "a number of frames or 'full'"),
+    "bad smoothing": ([CLIP, "--smoothing", "half"], "a number of frames, 'full' or 'none'"),
+    "negative smoothing": ([CLIP, "--smoothing", "-1"], "a number of frames, 'full' or"),
     "bad std": ([CLIP, "--measurement-std", "wide"], "a number or five"),
     "four stds": ([CLIP, "--measurement-std", "1,2,3,4"], "one number or five"),
     "bad lengths": ([CLIP, "--bone-lengths", "long"], "must be NAME=METRES with commas"),

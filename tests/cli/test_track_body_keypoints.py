@@ -10,7 +10,7 @@ import torch
 from tests.cli.test_track_body import HEIGHT, WIDTH, N, arms_rise, looking_at
 from torchpose import BodyTracker
 from torchpose.body import BODY_15, Body, fit_state
-from torchpose.camera import CameraRig, load_cameras, save_cameras
+from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli._body_keypoint_inputs import read_body_keypoints
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.skeleton._joint_sets import SKELETONS
@@ -164,11 +164,20 @@ def test_poses_from_all_kinds_of_files(track, scene, tmp_path):
 
 
 def test_one_camera_is_enough(track, scene, tmp_path):
-    given = ("--camera-names", "[front]", "--height", 1.75, *PLAIN)
+    given = ("--camera-names", "front", "--height", 1.75, *PLAIN)  # as well as [front]
     done = track(tmp_path, "front.npz", *given)
     assert done.code == 0, done.err
     assert len(BodyTrack.load(tmp_path / "body.npz")) == N
     assert "m by its bones, 1.75 m given" in done.out
+
+
+def test_cameras_without_poses_are_refused(torchpose, scene, tmp_path):
+    cameras = load_cameras(scene[0] / "cameras.toml").values()
+    save_cameras([PinholeCamera.from_matrix(c.matrix, WIDTH, HEIGHT, c.name) for c in cameras],
+                 tmp_path / "cameras.toml")  # fmt: skip
+    inputs = [scene[0] / name for name in MIXED]
+    done = torchpose("track-body", tmp_path / "cameras.toml", *inputs, "--out", tmp_path / "out")
+    assert done.code == 2 and "all cameras are in the same place" in done.err
 
 
 def test_the_body_is_drawn_into_videos(track, scene, tmp_path):

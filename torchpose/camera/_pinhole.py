@@ -317,6 +317,10 @@ def _image_side(name: str, value: Any) -> int | None:
 def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> PinholeCamera:
     if "matrix" not in table:
         raise CameraError(f"{where}: a camera needs `matrix` (3 x 3, pixels), got {sorted(table)}")
+    if ("rotation" in table) != ("translation" in table):
+        raise CameraError(
+            f"{where}: a pose needs `rotation` and `translation`, got {sorted(table)}"
+        )
     size = table.get("size", (None, None))
     try:
         if not isinstance(size, Sequence) or len(size) != 2:

@@ -71,7 +71,11 @@ def command() -> Command:
             "method_options": _method_options(names),
         },
         parse={"measurement_std": parse_stds, "smoothing": parse_smoothing},
-        metavars={"frame": "camera|body", "hands": "learnt|grid|mean-shift"},
+        metavars={
+            "smoothing": "N|full|none",
+            "frame": "camera|body",
+            "hands": "learnt|grid|mean-shift",
+        },
     )
 
 
@@ -190,20 +194,22 @@ def parse_stds(value: Any) -> float | list[float] | None:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def parse_smoothing(value: Any) -> int | str:
-    """Return a number of frames or "full".
+def parse_smoothing(value: Any) -> int | str | None:
+    """Return a number of frames, "full", or None for "none", as `track-body` has it.
 
     Raises:
         ArgumentError: anything else.
     """
     if value == "full":
         return "full"
+    if value in (None, "none"):
+        return None
     try:
         lag = int(str(value))
     except ValueError:
         lag = -1
     if lag < 0:
         raise ArgumentError(
-            None, f"--smoothing must be a number of frames or 'full', got {str(value)!r}"
+            None, f"--smoothing must be a number of frames, 'full' or 'none', got {str(value)!r}"
         )
     return lag

@@ -82,7 +82,7 @@ def command() -> Command:
             "method_options": _method_options(),
         },
         spaced=("inputs", "background", "videos", "formats"),
-        parse={"persons": parse_persons},
+        parse={"persons": parse_persons, "camera_names": parse_names},
         metavars={
             "cameras": "CAMERAS",
             "inputs": "INPUT",
@@ -252,6 +252,12 @@ def parse_persons(value: Any) -> int | str:
     return int(text)
 
 
+def parse_names(value: Any) -> list[str]:
+    """Return names from a list, or from text with commas and perhaps brackets."""
+    words = value if isinstance(value, list) else str(value).strip("[] ").split(",")
+    return [str(word).strip().strip("'\"") for word in words]
+
+
 def _run_on_keypoints(
     job: BodyJob,
     inputs: list[str],
@@ -406,7 +412,14 @@ def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[Pinhole
             f"{file}: expected a camera for each of the {n_inputs} inputs, got "
             f"{', '.join(names)}; it holds {', '.join(found)} (choose by --camera-names)"
         )
-    return [found[name] for name in names]
+    cameras = [found[name] for name in names]
+    places = {(*c.rotation.tolist(), *c.translation.tolist()) for c in cameras}
+    if len(cameras) > 1 and len(places) == 1:
+        raise CameraError(
+            f"{file}: all cameras are in the same place with the same rotation; expected `rotation` and "
+            "`translation` of each, of a calibration of all cameras together"
+        )
+    return cameras
 
 
 def _models(

@@ -17,7 +17,7 @@ from torchpose.io._keypoints import Keypoints
 from torchpose.priors._upper_body_prior import load_prior
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._upper_body import NECK_KINDS
-from torchpose.upper_body._estimator_table import METHODS, WINDOWS, method_options, replace_window
+from torchpose.upper_body._estimator_table import METHODS, method_options, replace_window
 from torchpose.upper_body._keypoint_doubts import doubts_about, refuse_another_size
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
@@ -41,8 +41,8 @@ class TrackSettings:
         camera_name: the name of the camera in a file that has several.
         measurement_std: the standard deviation of a keypoint in pixels: one number, or five with commas
             for hand, elbow, shoulder, head, neck; by default as the prior learnt it, else 3.
-        smoothing: use this many later frames, or all of them ("full"), for each estimate; with all but
-            mkf-sampled, mkf-split and the pf methods.
+        smoothing: use this many later frames, or all of them ("full"), for each estimate, or none of them
+            ("none"); with all but mkf-sampled, mkf-split and the pf methods.
         n_particles: the number of particles of the pf methods (default 10000).
         n_tracks: the number of tracks of mkf-sampled and mkf-split.
         arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
@@ -286,9 +286,11 @@ def _check_count(name: str, value: int, method: str | None) -> None:
     """Raise `InputError` unless the method has such a number, and it is positive."""
     option = f"--{name.replace('_', '-')}"
     having = [other for other in METHODS if name in method_options(other)]
-    if method is None or (method in METHODS and method not in having):
+    if method is None:
+        raise InputError(f"{option} needs --method, one of {', '.join(having)}")
+    if method in METHODS and method not in having:
         raise InputError(
-            f"{option} does not apply to --method {method or WINDOWS}; it is of {', '.join(having)}"
+            f"{option} does not apply to --method {method}; it is of {', '.join(having)}"
         )
     if value < 1:
         raise InputError(f"{option} must be at least 1, got {value}")
