@@ -1,5 +1,7 @@
 """Parts of tracking by keypoints against finite differences, dense algebra and exact geometry."""
 
+import math
+
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalman
 from torchpose.whole_body._keypoints.body_transition import transition
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    Beliefs,
     KeypointFrame,
     RigMaps,
     exchange_of,
@@ -121,6 +124,22 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     torch.testing.assert_close(found.joints, moved, rtol=0, atol=1e-6)
     W, _ = information(readings, seen, weighed)
     assert (torch.linalg.eigvalsh(W) >= -1e-6).all()
+
+
+def test_keypoints_of_joints_behind_a_camera_are_outliers():
+    given = scene(2, 1)
+    frame, maps = frame_of(given), RigMaps.of(given.rig)
+    exchange = exchange_of(BODY_15, torch.device("cpu"))
+    behind = given.joints - 1.4 * given.rig.rotation[0].T @ given.rig.translation[0]
+    seen = see(maps, behind)
+    assert not seen.in_front[:, 0].any() and seen.in_front[:, 1].all()
+    beliefs = Beliefs(torch.full((1, 2, 2), -6.0).double(), torch.ones(1, 2).double())
+    weighed = weigh(readings_of(frame, exchange), seen, maps, beliefs, exchange)
+    outlier = math.log(0.1 / (1920 * 1080 / 4))
+    assert torch.allclose(weighed.log_joint[:, 0], torch.tensor(outlier).double())
+    assert (weighed.own[:, 0] == 0).all() and (weighed.other[:, 0] == 0).all()
+    off = weigh(readings_of(frame, exchange), see(maps, given.joints + 1), maps, beliefs, exchange)
+    assert weighed.log_evidence < off.log_evidence + 1e-6
 
 
 def test_a_prediction_in_two_halves_is_one(motion):

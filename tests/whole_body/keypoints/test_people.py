@@ -8,7 +8,7 @@ import torch
 from tests.whole_body.keypoints.scenes import FPS, moving_body, ring
 from torchpose.errors import InputError, NobodySeenError, ShapeError
 from torchpose.whole_body import BodyTracker
-from torchpose.whole_body._keypoints.people_association import assign
+from torchpose.whole_body._keypoints.people_association import assign, detection_gains
 
 T = 40
 
@@ -98,6 +98,19 @@ def test_one_camera_tracks_two_persons_beside_each_other():
 def test_assignment_is_the_best_of_all():
     gains = torch.tensor([[5.0, 4.0, -1.0], [5.5, 1.0, -2.0], [-1.0, -3.0, -2.0]])[:, None]
     assert assign(gains)[:, 0].tolist() == [1, 0, -1]
+
+
+@pytest.mark.parametrize("confidence", [0.1, 1.0])
+def test_who_is_behind_a_camera_wants_none_of_its_detections(confidence):
+    rig, _, pixels = passing(3)
+    single = tracker(rig).by_keypoints
+    trust = torch.full_like(pixels[0, ..., 0], confidence).transpose(0, 1)
+    frame = single.frames(pixels[0].transpose(0, 1), trust, None, None)
+    state = single.tracker.advance(None, frame)[0].state
+    behind = state.mean.position - 1.4 * rig.rotation[0].T @ rig.translation[0]
+    moved = state._replace(mean=state.mean._replace(position=behind))
+    assert (detection_gains(single.tracker.filter, state, frame)[:, 0].amax(-1) > 0).all()
+    assert (detection_gains(single.tracker.filter, moved, frame)[:, 0] < 0).all()
 
 
 def test_bad_input_is_refused():

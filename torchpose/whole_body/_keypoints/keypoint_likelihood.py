@@ -8,7 +8,8 @@ anywhere in an area a:
 The noise has a part in pixels, and one that is relative to the body, whose size in the image goes with the
 depth: R = s_c (r + m f^2 / depth^2) I, with a factor s_c of the camera that the filter estimates. In each
 camera left and right of the arms, and of the legs, may be exchanged. Whether they are is a two-state chain
-over time. All of it is marginalised: the filter gets expected information about joints.
+over time. All of it is marginalised: the filter gets expected information about joints. A camera cannot see
+a joint behind it, so the keypoint of such a joint is an outlier, (1 - pi) / a.
 """
 
 import math
@@ -198,13 +199,14 @@ def weigh(
     size = 0.5 * seen.by_joint.square().sum((-2, -1))  # about f^2 / depth^2
     scale = (width * beliefs.scale)[..., None]
     variance = scale * (readings.variance + readings.relative * size)
-    inlier = torch.where(seen.in_front, readings.inlier, 0.0)
+    inlier, there = readings.inlier, readings.inlier > 0
+    present = there & seen.in_front
     density = _log_density(readings.pixels - seen.pixels, spread, variance, marginal)
     log_in = inlier.clamp_min(_LEAST).log() + density
-    either = torch.logaddexp(log_in, torch.log1p(-inlier) - maps.log_area[:, None])
-    present = inlier > 0
+    log_out = torch.log1p(-inlier) - maps.log_area[:, None]
+    either = torch.where(seen.in_front, torch.logaddexp(log_in, log_out), log_out)
     own, other = torch.where(present, (log_in - either).exp(), 0.0).unbind()
-    log_own, log_other = torch.where(present, either, 0.0).unbind()
+    log_own, log_other = torch.where(there, either, 0.0).unbind()
     gain = (log_other - log_own) @ exchange.groups.mT
     log_odds = beliefs.log_odds
     exchanged = (log_odds + gain if decide else log_odds).sigmoid()

@@ -71,13 +71,8 @@ def keypoint_log_likelihood(
         [B, N], float64; 0 in elements without a keypoint. No keypoint, however far off, lowers it by more
         than the density of outliers does.
     """
-    readings, seen, weighed = _weighed(measured, joints)
-    # a joint behind a camera makes its keypoint an outlier, which `weigh` leaves out
-    inlier = readings.inlier[0]
-    behind = (inlier > 0) & ~seen.in_front
-    outlier = torch.log1p(-inlier) - measured.maps.log_area[:, None]
-    value = weighed.log_evidence + torch.where(behind, outlier, 0.0).sum((-2, -1))
-    return measured.power * value.view(joints.shape[:2])
+    weighed = _weighed(measured, joints)[2]
+    return measured.power * weighed.log_evidence.view(joints.shape[:2])
 
 
 def limbs_given_keypoints(

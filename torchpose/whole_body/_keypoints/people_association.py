@@ -4,8 +4,9 @@ A detection d of camera c is that of person p rather than that of somebody new b
 
     g_pcd = sum_j log p(z_cdj | x_p) - log N(z_cdj; somewhere within a body's size),
 
-with the filter's own predictive density of keypoints. In each camera the assignment of detections to persons
-that has the largest sum of log odds is taken; a person without any above 0 has none.
+with the filter's own predictive density of keypoints. Where p's joint is behind the camera, that of somebody
+new may be anywhere in its image. In each camera the assignment of detections to persons that has the largest
+sum of log odds is taken; a person without any above 0 has none.
 """
 
 import math
@@ -63,7 +64,8 @@ def detection_gains(
         joint_cov[persons], marginal=True,
     )  # fmt: skip
     there = pairs.inlier > 0
-    gain = (weighed.log_joint - torch.where(there, _of_another(seen), 0.0)).sum(-1)
+    of_another = torch.where(seen.in_front, _of_another(seen), -filter.maps.log_area[:, None])
+    gain = (weighed.log_joint - torch.where(there, of_another, 0.0)).sum(-1)
     gain = torch.where(there.any(-1), gain, -math.inf)
     return gain.unflatten(0, (n_persons, n_detections)).mT
 
