@@ -31,7 +31,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 
-__all__ = ["assign", "detection_gains", "group_detections", "taken_detections"]
+__all__ = ["assign", "detection_gains", "group_detections", "left_over", "taken_detections"]
 
 LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
 _BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
@@ -43,13 +43,13 @@ _HEIGHT = 1.7  # metres, of the bones expected
 
 
 def detection_gains(
-    filter: BodyKalmanFilter, predicted: BodyGaussian, frame: KeypointFrame
+    filter: BodyKalmanFilter, predicted: BodyGaussian, frame: KeypointFrame, width: float = 1.0
 ) -> Float[Tensor, "P C D"]:
     """Return the log odds of detections as those of persons against somebody new, -inf without keypoints.
 
     Args:
         filter: that predicted. predicted: one state for each of P persons.
-        frame: [D, C, J], of the D detections of each camera.
+        frame: [D, C, J], of the D detections of each camera. width: factor of the noise's variance.
     """
     joints, jacobian = filter.articulation.linearise(predicted.mean)
     joint_cov = (jacobian @ predicted.cov.unsqueeze(-3)) @ jacobian.mT
@@ -61,7 +61,7 @@ def detection_gains(
     beliefs = Beliefs(*(value[persons] for value in predicted.beliefs))
     weighed = weigh(
         readings_of(pairs, filter.exchange), seen, filter.maps, beliefs, filter.exchange,
-        joint_cov[persons], marginal=True,
+        joint_cov[persons], marginal=True, width=width,
     )  # fmt: skip
     there = pairs.inlier > 0
     of_another = torch.where(seen.in_front, _of_another(seen), -filter.maps.log_area[:, None])
@@ -91,6 +91,18 @@ def assign(gains: Float[Tensor, "P C D"]) -> Int[Tensor, "P C"]:
         gained = gains[:, camera].gather(-1, chosen.clamp_min(0)[:, None]).squeeze(-1)
         wanted[:, camera] = torch.where((chosen >= 0) & (gained > 0), chosen, -1)
     return wanted
+
+
+def left_over(gains: Float[Tensor, "P C D"], chosen: Int[Tensor, "P C"]) -> Int[Tensor, "P C"]:
+    """Return the detections of persons, where they have none those by other gains that nobody has.
+
+    Args:
+        gains: by which they may get one. chosen: what they have already, -1 if none.
+    """
+    places = torch.arange(gains.shape[-1], device=gains.device)
+    owned = (chosen[..., None] == places).any(0)
+    rest = gains.masked_fill(owned | (chosen >= 0)[..., None], -math.inf)
+    return torch.where(chosen >= 0, chosen, assign(rest))
 
 
 def _hungarian(values: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.whole_body._keypoints.body_kalman import CorrectedBody
+from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointPoses,
@@ -19,6 +19,7 @@ from torchpose.whole_body._keypoints.people_association import (
     assign,
     detection_gains,
     group_detections,
+    left_over,
     taken_detections,
 )
 
@@ -30,6 +31,7 @@ _GONE_TIME = 1.0  # seconds without keypoints after which a person has left
 _ALONE_TIME = 0.25  # seconds with one camera, after which its keypoints may begin somebody else
 _SAME = 0.15  # metres between joints, on average, below which two persons are one
 _SAME_TIME = 0.2  # seconds of that
+_DOUBT = 9.0  # factor of the variance of keypoints of a camera that nobody's body explains
 _LEAST_INLIERS = 0.5  # share of the keypoints of a start that must be those of a body
 
 
@@ -116,7 +118,7 @@ class PeopleTracker:
         assert bodies is not None
         predicted = self.tracker.filter.predict(bodies.state)
         gains = detection_gains(self.tracker.filter, predicted, frame)
-        chosen = assign(gains)
+        chosen = self._chosen(gains, predicted, frame, there)
         keypoints = taken_detections(frame, chosen)
         after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted)
         found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
@@ -124,6 +126,25 @@ class PeopleTracker:
         explained = (gains > 0).masked_fill(weak[:, None, None], False).any(0)
         owned = _owned(chosen[~weak], there)
         return stream._replace(bodies=after), found, there & ~explained & ~owned, weak
+
+    def _chosen(
+        self,
+        gains: Float[Tensor, "P C D"],
+        predicted: BodyGaussian,
+        frame: KeypointFrame,
+        there: Bool[Tensor, "C D"],
+    ) -> Int[Tensor, "P C"]:
+        """Return the detection of every person in every camera, -1 if none.
+
+        A camera whose calibration is off sees people elsewhere. How far is learnt from their detections, so
+        one that nobody wants is also theirs who are near it by a noise that is larger.
+        """
+        chosen = assign(gains)
+        wanted = (gains > 0).any(0)
+        if not bool(((chosen < 0).any(0)[:, None] & there & ~wanted).any()):
+            return chosen
+        wide = detection_gains(self.tracker.filter, predicted, frame, _DOUBT)
+        return left_over(wide.masked_fill(wanted, -math.inf), chosen)
 
     # --- persons who enter ------------------------------------------------------------------------
 
