@@ -15,8 +15,8 @@ from importlib import import_module
 __all__ = ["main"]
 
 COMMANDS = {
-    "track": "2D keypoints to 2D and 3D poses",
-    "track-body": "videos of calibrated cameras to the poses of a whole body",
+    "track": "video or 2D keypoints to poses of the upper body",
+    "track-body": "keypoints or videos of calibrated cameras to poses of the whole body",
     "fit": "fit a prior to recorded 3D poses",
     "evaluate": "score priors on recordings: score, leave-one-person-out, ...",
     "demo": "track an animated performer; needs no data",
@@ -99,7 +99,7 @@ def _help() -> str:
     commands = "\n".join(f"  {name:<11} {text}" for name, text in COMMANDS.items())
     return (
         "usage: torchpose COMMAND ...\n\n"
-        "Bayesian human-pose tracking: from 2D keypoints, gaps and all, to 3D poses.\n\n"
+        "Bayesian human-pose tracking: from video or 2D keypoints, gaps and all, to 3D poses.\n\n"
         f"commands:\n{commands}\n\n"
         "options:\n"
         "  -h, --help  this text; `torchpose COMMAND --help` for the options of a command\n"
