@@ -13,7 +13,8 @@ rig = CameraRig([
     for name, turn in turns.items()
 ])  # fmt: skip
 states = torch.zeros(40, 36, dtype=torch.float64)
-states[:, 0], states[:, 3] = torch.linspace(0, 0.2, 40), math.pi  # x, and upright where y points down
+states[:, 0] = torch.linspace(0, 0.2, 40)  # metres to the side
+states[:, 3] = math.pi  # upright where y points down
 truth = Body.of_height(BODY_15, 1.75).joints(states)
 keypoints = rig(truth).pixels  # [T, C, J, 2] of a detector
 keypoints[10:20, 0, 5] = torch.nan  # one joint is hidden from the first camera
