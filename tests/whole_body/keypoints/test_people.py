@@ -60,7 +60,8 @@ def test_a_camera_that_is_turned_is_used_all_the_same():
     rig.rotation[0], rig.translation[0] = turn @ rig.rotation[0], turn @ rig.translation[0]
     found = tracker(rig)(keypoints=shuffled(pixels)[0], persons="all")
     assert [len(one) for one in found] == [T, T]
-    for one in found:  # by 1.3 degrees joints are 9 cm off at 4 m, seven times the noise of keypoints
+    # by 1.3 degrees joints are 9 cm off at 4 m, seven times the noise of keypoints
+    for one in found:
         assert (one.details["detection"] >= 0).double().mean(0).min() > 0.95
 
 
