@@ -190,6 +190,7 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
         (["--action", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--delays", "[1,2]"], "one entry for each"),
         (["--height", "-1"], "--height"),
+        (["--height", "182"], "--height must lie between 0.5 and 2.6 m"),
         (["--camera-names", "[front,left]"], "a camera for each of the 3 inputs"),
         (["--facing", "[1,0]"], "three numbers"),
     ],

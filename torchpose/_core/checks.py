@@ -22,6 +22,7 @@ __all__ = [
     "check_finite",
     "check_floating",
     "check_grey",
+    "check_height",
     "check_positive",
     "check_rate",
     "check_real",
@@ -32,6 +33,7 @@ __all__ = [
     "refuse_unused",
 ]
 
+_SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second
 
 
@@ -145,6 +147,15 @@ def check_positive(name: str, value: float) -> float:
     if not 0 < value < math.inf:
         raise InputError(f"{name} must be positive and finite, got {value}")
     return value
+
+
+def check_height(height: float, name: str = "height") -> float:
+    """Return the height of a person, or raise `InputError` unless it can be one in metres."""
+    if not isinstance(height, int | float) or not _SMALLEST <= height <= _TALLEST:
+        raise InputError(
+            f"{name} must lie between {_SMALLEST} and {_TALLEST} m, got {height!r}; it is in metres"
+        )
+    return float(height)
 
 
 def check_count(name: str, value: int) -> None:

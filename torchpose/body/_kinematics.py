@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_finite, check_height, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose.body._limbs import (
     Limbs,
@@ -202,8 +202,9 @@ class Body(nn.Module):
             `Body` with the skeleton's standard lengths and radii.
 
         Raises:
-            InputError: a height that is not positive, or an unknown frame.
+            InputError: a height that nobody has, or an unknown frame.
         """
+        check_height(height)
         lengths, radii = skeleton.standard_lengths(height), skeleton.standard_radii(height)
         return cls(skeleton, lengths, radii, frame=frame, dtype=dtype)
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from torchpose._core.checks import check_choice, check_positive
+from torchpose._core.checks import check_choice, check_height, check_positive
 from torchpose._core.terminal import show_progress
 from torchpose.cli._body_recordings import Recordings, SilhouetteSettings
 from torchpose.cli._command import Command, Given
@@ -383,9 +383,11 @@ def _check(values: dict[str, Any]) -> None:
     """Raise `InputError` for values out of range, and for lists that do not go with the inputs."""
     from torchpose.whole_body._body_files import BODY_FORMATS
 
-    for key in ("height", "sharpness", "rows", "n_particles", "fps", "keypoint_std", "pixel_std"):
+    for key in ("sharpness", "rows", "n_particles", "fps", "keypoint_std", "pixel_std"):
         if values[key] is not None:
             check_positive(f"--{key.replace('_', '-')}", values[key])
+    if values["height"] is not None:
+        check_height(values["height"], "--height")
     facing, n_inputs = values["facing"], len(values["inputs"])
     if facing is not None and len(facing) != 3:
         raise InputError(f"--facing must be three numbers, got {facing}")

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_choice
+from torchpose._core.checks import check_choice, check_height
 from torchpose.errors import InputError
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.upper_body._estimator import Bones
@@ -35,7 +35,6 @@ _POWER = 0.1  # of a frame's likelihood of the lengths: frames of one pose are a
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _GIVEN = 0.02  # of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres
-_SMALLEST, _TALLEST = 0.5, 2.6  # metres
 _HEIGHT = 1.70  # metres: of whom the prior's lengths are taken for
 _OF_HEIGHT = 0.055  # of the log of a length: what the heights of grown-ups explain
 _SUREST = 0.01  # of the log of a length relative to others
@@ -129,11 +128,7 @@ class BodyLengths:
 
     def _grow(self, height: float) -> None:
         """Expect the lengths of a person of this height."""
-        if not isinstance(height, int | float) or not _SMALLEST <= height <= _TALLEST:
-            raise InputError(
-                f"height must lie between {_SMALLEST} and {_TALLEST} m, got {height!r}; it is in metres"
-            )
-        self.usual = self.usual * (height / _HEIGHT)
+        self.usual = self.usual * (check_height(height) / _HEIGHT)
         left = (self.spread.square() - _OF_HEIGHT**2).clamp_min(_LEAST**2)
         self.spread = left.sqrt().minimum(self.spread)
 
