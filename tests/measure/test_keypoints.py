@@ -132,6 +132,15 @@ def test_the_largest_are_taken():
     assert measured.person.tolist() == [1] and measured.sizes.tolist() == pytest.approx([104.0])
 
 
+def test_somebody_smaller_does_not_take_the_place_of_who_is_missed_for_a_moment():
+    pair = [at(150.0), at(450.0, scale=1.3)]
+    frames = [pair[:1] if t % 10 == 9 else pair for t in range(40)]
+    people = [f.person.tolist() for f in run(Scripted(frames), 40, max_persons=1)]
+    assert people[2:] == [[] if t % 10 == 9 else [1] for t in range(2, 40)]
+    left = run(Scripted([pair] * 10 + [pair[:1]] * 40), 50, max_persons=1)
+    assert left[-1].person.tolist() == [0]
+
+
 def test_a_detector_is_reset_before_a_video():
     detector = Scripted([[at(200.0)]] * 5)
     first, second = run(detector, 5), run(detector, 5)
