@@ -69,7 +69,10 @@ def test_colours_are_shares():
     colours = clothes_colours(image, faces)
     assert torch.allclose(colours.sum(1), torch.ones(2, dtype=torch.float64))
     assert float((colours[0] * colours[1]).sqrt().sum()) < 0.5
-    assert clothes_colours(image, torch.tensor([[100.0, 900.0, 30.0]])).sum() == 0
+    outside = torch.tensor(
+        [[x, y, 30.0] for x, y in ((100, 900), (100, -90), (-90, 50), (730, 50))]
+    )
+    assert clothes_colours(image, outside).sum() == 0
 
 
 def test_what_is_below_a_face_that_is_followed_blindly_is_not_learnt():

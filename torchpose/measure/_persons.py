@@ -122,7 +122,8 @@ def _histogram(image: Image, face: list[float]) -> np.ndarray:
     rows, columns = image.shape[:2]
     half, top, bottom = (share * size for share in _CLOTHES)
     left, right = int(max(0, x - half)), int(min(columns, x + half))
-    part = image[int(max(0, y + top)) : int(min(rows, y + bottom)), max(0, left) : max(0, right)]
+    above, below = int(max(0, y + top)), int(min(rows, y + bottom))
+    part = image[above : max(0, below), max(0, left) : max(0, right)]
     step = max(1, int(size / 20))
     bins = (part[::step, ::step].reshape(-1, 3) >> 5).astype(np.int64)
     counts = np.bincount(bins @ np.array([64, 8, 1]), minlength=_BINS**3).astype(np.float64)
