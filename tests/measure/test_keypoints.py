@@ -110,6 +110,24 @@ def test_what_is_unsure_or_outside_of_the_image_is_missing():
     assert run(detector, 5, min_confidence=0.5)[-1].person.tolist() == []
 
 
+def test_what_has_no_confidence_is_not_outside_of_the_image():
+    class Placed(Scripted):
+        def reset(self):
+            pass
+
+        def __call__(self, image):
+            points, confidence = at(300.0)[None].clone(), torch.full((1, 17), 0.9)
+            points[0, 9:11] = torch.tensor([[-1.0, -1.0], [-20.0, 200.0]])
+            confidence[0, 9:11] = torch.tensor([0.0, 0.1])
+            return points, confidence
+
+    (absent,) = run(Placed([]), 4)[-1].absent
+    assert float(absent[10]) == pytest.approx(
+        0.95
+    )  # where the wrist is, is said, though not surely
+    assert absent.isnan().tolist() == [k != 10 for k in range(17)]
+
+
 def test_a_head_may_be_above_the_image():
     class Heads(Scripted):
         def reset(self):

@@ -197,7 +197,7 @@ class KeypointMeasurer:
         keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
         there = sure[:, self._upper].sum(1) >= least_seen(len(self._upper))
         confidence = torch.where(sure, found.confidence, 0.0)
-        beyond = found.keypoints.isfinite().all(-1) & ~inside
+        beyond = found.keypoints.isfinite().all(-1) & ~inside & (found.confidence > 0)
         absent = torch.where(beyond, _BEYOND, torch.nan).to(confidence)
         return _Sure(keypoints[there], confidence[there], absent[there])
 
