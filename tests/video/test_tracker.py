@@ -21,6 +21,14 @@ def prior(small_windows_file):
     return UpperBodyPrior.load(small_windows_file)
 
 
+class Video(list):
+    """Frames with a rate."""
+
+    def __init__(self, frames, fps):
+        super().__init__(frames)
+        self.fps = fps
+
+
 def rendered(*performances):
     from torchpose.demo._rendering import Scene, render_performance
 
@@ -171,11 +179,23 @@ def test_bad_use_is_refused(prior):
     with pytest.raises(InputError, match="max_gap"):
         VideoTracker(prior, demo_camera(), max_gap=0.0)
     tracker = VideoTracker(prior, demo_camera())
+    small = np.zeros((20, 30, 3), np.uint8)
+    with pytest.raises(
+        InputError, match="30 x 20 pixels, and the camera is for images of 640 x 480"
+    ):
+        tracker([small])
+    with pytest.raises(InputError, match="30 x 20 pixels"):
+        tracker.step(tracker.init(), small)
+    with pytest.raises(InputError, match=r"15\.08 frames per second, and the tracker is for 30"):
+        tracker(Video([], 15.08))
+    with pytest.raises(InputError, match="25 frames per second"):
+        tracker.advance(tracker.init(), Video([], 25.0))
+    assert tracker(Video([], 29.97)) == tracker(Video([], 0.0)) == []
     with pytest.raises(InputError, match="uint8"):
         tracker([np.zeros((20, 20, 3))])
     with pytest.raises(InputError, match="RGB tensor"):
         tracker(torch.zeros(1, 20, 20, 3, dtype=torch.uint8))
     smoother = VideoTracker(prior, demo_camera(), smoothing="full")
     with pytest.raises(InputError, match="smoothing"):
-        smoother.step(smoother.init(), np.zeros((20, 20, 3), np.uint8))
+        smoother.step(smoother.init(), small)
     assert tracker([]) == []
