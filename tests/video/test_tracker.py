@@ -1,13 +1,14 @@
 """Persons of a video who leave, return and cross, rendered."""
 
 import sys
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from torchpose import VideoTracker, load_prior
+from torchpose import PinholeCamera, VideoTracker, load_prior
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.priors import UpperBodyPrior
@@ -106,6 +107,23 @@ def test_only_the_largest_face_is_followed_if_asked_for(prior, two_persons):
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", max_persons=1)
     people = tracker(two_persons[:30])
     assert len(people) == 1
+
+
+@pytest.mark.parametrize("edges", [False, True])
+def test_images_are_held_for_edges_alone(prior, edges):
+    there, held = set(), []
+
+    def frames():
+        for _ in range(40):
+            image = np.full((48, 64, 3), 90, np.uint8)
+            there.add(id(image))
+            weakref.finalize(image, there.discard, id(image))
+            held.append(len(there))
+            yield image
+
+    camera = PinholeCamera.from_image_size(64, 48)
+    assert VideoTracker(prior, camera, method="mkf-fixed", edges=edges)(frames()) == []
+    assert max(held) >= 32 if edges else max(held) <= 8
 
 
 def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one_person):

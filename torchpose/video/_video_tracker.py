@@ -273,7 +273,7 @@ class VideoTracker(nn.Module):
             for number, parts in poses.items():
                 placed = (part._replace(start=place + part.start) for part in parts)
                 tracked.setdefault(number, []).extend(placed)
-            place, last = place + len(block.images), after
+            place, last = place + len(block.found), after
         return last, tracked
 
     def forward(
@@ -310,8 +310,8 @@ class VideoTracker(nn.Module):
             tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
         ):
             for state, block, tracked in blocks:
-                recording.append(tracked, len(block.images))
-                bar.update(len(block.images))
+                recording.append(tracked, len(block.found))
+                bar.update(len(block.found))
                 if watch is not None:
                     watch(block.images[-1], block.found[-1], dict(state.poses))
         return recording.finish(self.smoother)
@@ -350,7 +350,10 @@ class VideoTracker(nn.Module):
                 state, tracked = self._follow(state, block)
                 yield state, block, tracked
             return
-        blocks = measure_blocks(measurer, state.measurer, seen, size)
+        keep = (
+            size == 1 or self.stream.association is not None
+        )  # who watches single frames, and edges
+        blocks = measure_blocks(measurer, state.measurer, seen, size, keep)
         with closing(prefetch(blocks, 1) if ahead else blocks) as measured:
             for block in measured:
                 state, tracked = self._follow(state, block)
