@@ -65,7 +65,7 @@ def track_video(
             else:
                 people, n_frames = _track_camera(tracker, source, results.stage, overlay)
             seconds = time.perf_counter() - start
-            notes += tuple(source.notes)
+        notes += tuple(source.notes)  # some of them are known once it is closed
         if not people:
             return _nobody(job.input, n_frames, notes, results.folder, options["detector"])
         facts = {
