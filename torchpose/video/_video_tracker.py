@@ -124,8 +124,8 @@ class VideoTracker(nn.Module):
         candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then
             measured and filtered in turn, which is slower.
         face_detector: the detector of faces; by default Haar's.
-        max_persons: track at most N persons at a time: the largest faces, or persons of a detector. One who
-            is tracked gives way only to somebody a fifth larger.
+        max_persons: measure at most N persons at a time: the largest faces, or persons of a detector. One who
+            is measured gives way only to somebody a fifth larger, and counts as one who left.
         head_neck: the offsets of head and neck from the face; see `UpperBodyMeasurer`.
         detector: find keypoints with a detector, in place of faces, skin and hands: a model in ONNX
             (.onnx), a pose landmarker of MediaPipe (.task), or package:factory, which Python imports and
