@@ -183,9 +183,9 @@ def draw_overlay(
         A new image of the same size.
 
     Raises:
-        InputError: not an RGB image of uint8, labels or tints of another number than persons or faces, or
-            a level outside (0, 1).
-        ShapeError: tensors of other shapes.
+        InputError: not an RGB image of uint8, labels or tints of another number than persons, or a
+            level outside (0, 1).
+        ShapeError: tensors of other shapes, or another number of faces than of their tints.
 
     >>> frame = np.zeros((48, 64, 3), dtype=np.uint8)
     >>> nobody = torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool)
