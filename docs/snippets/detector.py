@@ -22,7 +22,7 @@ class HeadsAndNecks:
 prior = torchpose.load_prior("kinect-upper-body")
 with torchpose.video.open_video("clip.mp4") as video:
     camera = torchpose.PinholeCamera.from_image_size(*video.size)
-    tracker = torchpose.VideoTracker(prior, camera, detector=HeadsAndNecks())
+    tracker = torchpose.VideoTracker(prior, camera, fps=video.fps, detector=HeadsAndNecks())
     people = tracker(video)
 print(len(people), people[0].track.joints3d.shape[2:])
 # > 1 torch.Size([8, 3])

@@ -25,6 +25,6 @@ class OtherCascade:
 prior = torchpose.load_prior("kinect-upper-body")
 with torchpose.video.open_video("clip.mp4") as video:
     camera = torchpose.PinholeCamera.from_image_size(*video.size)
-    tracker = torchpose.VideoTracker(prior, camera, face_detector=OtherCascade())
+    tracker = torchpose.VideoTracker(prior, camera, fps=video.fps, face_detector=OtherCascade())
     print(len(tracker(video)))
 # > 1

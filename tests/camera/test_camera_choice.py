@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.camera._choice import fit_to_size, is_padded
+from torchpose.camera._choice import fit_to_size, is_padded, resolve_camera
 from torchpose.errors import CameraError
 
 CAMERA = PinholeCamera(800, 810, 310, 250, 640, 480, "front", distortions=(0.1, -0.02),
@@ -27,6 +27,14 @@ def test_a_camera_is_scaled_as_a_rig_is():
 @pytest.mark.parametrize("size", [None, (640, 480), (632, 470)])
 def test_the_same_size_and_that_of_a_codec_change_nothing(size):
     assert fit_to_size(CAMERA, size, "a.npz") == (CAMERA, ())
+
+
+@pytest.mark.parametrize("size", [None, (640, 480)])
+def test_four_numbers_are_of_the_inputs_images(size):
+    camera, notes = resolve_camera("525,526,319.5,239.5", None, size, None, "clip.mp4")
+    assert camera.image_size == size and notes == ()
+    expected = PinholeCamera(525, 526, 319.5, 239.5)
+    assert torch.equal(camera.matrix, expected.matrix)
 
 
 def test_padding_is_less_than_a_block():

@@ -6,7 +6,8 @@ import pytest
 from torchpose import demo
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
-from torchpose.video import VideoWriter
+from torchpose.video import VideoWriter, draw_overlay
+from torchpose.video._camera import CameraSource
 
 N = 36
 DETECTOR = """
@@ -26,6 +27,12 @@ class two:
         one = POINTS[self.at]
         self.at += 1
         return np.stack([one - [90, 0], one + [110, 10]]), np.full((2, len(NAMES)), 0.8)
+
+
+class passing(two):
+    def __call__(self, image):
+        there = [self.at < 18, self.at >= 4]
+        return [found[there] for found in super().__call__(image)]
 
 
 class nobody(two):
@@ -74,6 +81,64 @@ def test_everybody_whom_a_detector_finds_has_poses(track, folder):
     assert bool(first.observed.all()) and first.joints2d.shape[1] == N - 2
     apart = (second.joints2d - first.joints2d).median(1).values[0, UPPER_BODY.index("neck")]
     assert apart.tolist() == pytest.approx([200.0, 10.0], abs=6)
+
+
+class Blank:
+    """A camera that shows nothing."""
+
+    def __init__(self, n_frames):
+        self.left = n_frames
+
+    def isOpened(self):
+        return True
+
+    def read(self):
+        self.left -= 1
+        return self.left >= 0, np.full((480, 640, 3), 90, np.uint8)
+
+    def get(self, prop):
+        return 30.0
+
+    def set(self, prop, value):
+        return True
+
+    def release(self):
+        pass
+
+
+def test_persons_before_a_camera_have_the_names_that_they_had_while_it_ran(
+    torchpose, files, folder, monkeypatch
+):
+    """The first one passes by, the second one stays for longer."""
+    monkeypatch.setattr("torchpose.video._camera.time.sleep", lambda seconds: None)
+    monkeypatch.setattr(
+        "torchpose.video.open_video",
+        lambda where, fps=None: CameraSource(int(where), fps, lambda index: Blank(N + 10)),
+    )
+    shown = []
+
+    def spy(image, poses, *others, labels=None, tints=None, **options):
+        shown.append((labels, tints))
+        return draw_overlay(image, poses, *others, labels=labels, tints=tints, **options)
+
+    monkeypatch.setattr("torchpose.video._overlay.draw_overlay", spy)
+    options = (
+        "--prior",
+        files / "prior.safetensors",
+        "--pictures",
+        "false",
+        "--method",
+        "mkf-fixed",
+    )
+    given = ("--detector", "some_detectors:passing", *options)
+    done = torchpose("track", 0, "--out", folder / "out", *given)
+    assert done.code == 0, done.err
+    assert (["person 1", "person 2"], [0, 1]) in shown
+    assert f"person 2: frames 6 to {N - 1}, in poses.npz" in done.out
+    assert "person 1: frames 2 to 17, in poses_p02.npz" in done.out
+    assert "of person 2:" in done.out
+    page = (folder / "out" / "report.html").read_text()
+    assert page.index('"label":"person 2"') < page.index('"label":"person 1"')
 
 
 @pytest.mark.parametrize(

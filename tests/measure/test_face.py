@@ -110,6 +110,40 @@ def test_without_a_face_the_whole_image_is_searched_now_and_then():
     assert bool(tracker.usable(states[-1]).all())
 
 
+@pytest.mark.parametrize("size", [20.0, 90.0, 300.0])
+def test_a_face_that_walks_out_of_the_image_is_searched_for_in_what_is_left_of_it(size):
+    """On every side, in steps of a sixth of a pixel of the searched image."""
+    parts = []
+
+    def noted(image, region=None):
+        parts.append(image[region.top : region.bottom, region.left : region.right].shape)
+        return nobody(image)
+
+    tracker, image = FaceTracker(noted, detail=80.0), np.zeros((480, 640), np.uint8)
+    for out in np.arange(0.9, 1.3, 1 / 480) * size:
+        for place in ((-out, 200.0), (639 + out, 200.0), (300.0, -out), (300.0, 479 + out)):
+            assert len(tracker._look_near(image, [*place, size])) == 0
+    assert min(map(min, parts)) >= 1
+    assert max(map(min, parts)) <= 0.25 * 80  # never the rest of the image
+
+
+def test_a_face_that_is_lost_while_it_becomes_smaller_ends():
+    sizes = [90.0] * 9 + [90.0 * 0.89**t for t in range(9)] + [None] * 30
+
+    def whole(image, region=None):
+        size = sizes[int(image[0, 0])]
+        there = size is not None and region is None
+        return torch.tensor([[300.0, 200.0, size]]).double() if there else nobody(image)
+
+    tracker, states = FaceTracker(whole, every=1, whole_every=1, search_every=1), []
+    for t in range(len(sizes)):
+        before = states[-1] if states else tracker.init()
+        states.append(tracker.step(before, np.full((480, 640), t, np.uint8)))
+    assert len(states[17].mean) == 1 and bool(tracker.usable(states[17]).all())
+    assert all(bool((state.mean[:, 2] > 0).all()) for state in states)
+    assert len(states[-1].mean) == 0 and states[-1].next_identity == 1
+
+
 def test_one_face_in_two_overlapping_regions_is_one_detection():
     near = [[200.0, 200.0, 80.0], [250.0, 200.0, 80.0]]
     _, states, _ = follow([near] * 4 + [near[:1]] * 2, every=1, whole_every=100)

@@ -110,6 +110,24 @@ def test_what_is_unsure_or_outside_of_the_image_is_missing():
     assert run(detector, 5, min_confidence=0.5)[-1].person.tolist() == []
 
 
+def test_what_has_no_confidence_is_not_outside_of_the_image():
+    class Placed(Scripted):
+        def reset(self):
+            pass
+
+        def __call__(self, image):
+            points, confidence = at(300.0)[None].clone(), torch.full((1, 17), 0.9)
+            points[0, 9:11] = torch.tensor([[-1.0, -1.0], [-20.0, 200.0]])
+            confidence[0, 9:11] = torch.tensor([0.0, 0.1])
+            return points, confidence
+
+    (absent,) = run(Placed([]), 4)[-1].absent
+    assert float(absent[10]) == pytest.approx(
+        0.95
+    )  # where the wrist is, is said, though not surely
+    assert absent.isnan().tolist() == [k != 10 for k in range(17)]
+
+
 def test_a_head_may_be_above_the_image():
     class Heads(Scripted):
         def reset(self):
@@ -130,6 +148,15 @@ def test_the_largest_are_taken():
     frames = [[at(120.0), at(320.0, scale=1.3), at(520.0)]] * 5
     (measured,) = run(Scripted(frames), 5, max_persons=1)[-1:]
     assert measured.person.tolist() == [1] and measured.sizes.tolist() == pytest.approx([104.0])
+
+
+def test_somebody_smaller_does_not_take_the_place_of_who_is_missed_for_a_moment():
+    pair = [at(150.0), at(450.0, scale=1.3)]
+    frames = [pair[:1] if t % 10 == 9 else pair for t in range(40)]
+    people = [f.person.tolist() for f in run(Scripted(frames), 40, max_persons=1)]
+    assert people[2:] == [[] if t % 10 == 9 else [1] for t in range(2, 40)]
+    left = run(Scripted([pair] * 10 + [pair[:1]] * 40), 50, max_persons=1)
+    assert left[-1].person.tolist() == [0]
 
 
 def test_a_detector_is_reset_before_a_video():

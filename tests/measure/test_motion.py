@@ -1,5 +1,7 @@
 """Motion in windows: differences, running median and optical flow of drawn scenes."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -54,6 +56,19 @@ def test_flow_points_back_to_where_things_were():
     inner = flow[0, 42:52, 35:45].mean((0, 1)) * EVIDENCE
     np.testing.assert_allclose(inner, [-4, 2], atol=1.0)
     assert flow[0, :20].abs().max() < 0.3
+
+
+def test_flow_in_two_threads_is_that_in_one():
+    start, known = torch.zeros(1, *SHAPE, 2), torch.tensor([True])
+    pairs = [(scene(64, 78, seed)[1], scene(60, 80, seed)[1]) for seed in (0, 1)]
+
+    def flows(pair):
+        return [dense_flow(*pair, start, known)[0] for _ in range(60)]
+
+    alone = [dense_flow(*pair, start, known)[0] for pair in pairs]
+    with ThreadPoolExecutor(2) as threads:
+        for expected, found in zip(alone, threads.map(flows, pairs), strict=True):
+            assert all(torch.equal(flow, expected) for flow in found)
 
 
 def test_a_moved_window_keeps_what_it_knew():

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose import load_prior
 from torchpose.errors import InputError
-from torchpose.measure._persons import PersonRegister, clothes_colours
+from torchpose.measure._persons import PersonRegister, clothes_colours, largest_persons
+from torchpose.measure._upper_body_measurer import UpperBodyMeasurer
 
 RED, BLUE, GREEN = (200, 30, 40), (20, 40, 180), (40, 160, 60)
 
@@ -67,7 +69,10 @@ def test_colours_are_shares():
     colours = clothes_colours(image, faces)
     assert torch.allclose(colours.sum(1), torch.ones(2, dtype=torch.float64))
     assert float((colours[0] * colours[1]).sqrt().sum()) < 0.5
-    assert clothes_colours(image, torch.tensor([[100.0, 900.0, 30.0]])).sum() == 0
+    outside = torch.tensor(
+        [[x, y, 30.0] for x, y in ((100, 900), (100, -90), (-90, 50), (730, 50))]
+    )
+    assert clothes_colours(image, outside).sum() == 0
 
 
 def test_what_is_below_a_face_that_is_followed_blindly_is_not_learnt():
@@ -81,6 +86,50 @@ def test_what_is_below_a_face_that_is_followed_blindly_is_not_learnt():
         state, _ = register.step(state, wall, faces, who, time, torch.tensor([False]))
     state, number = register.step(state, worn, faces, torch.tensor([1]), 100)
     assert number.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "before", "chosen"),
+    [
+        ((30.0, 33.0, 25.0), (), [1]),
+        ((30.0, 33.0, 25.0), (4,), [0]),  # somebody a little larger does not take the place
+        ((30.0, 37.0, 25.0), (4,), [1]),
+        ((30.0, 33.0, 28.0), (4, 9), [0, 2]),
+        ((30.0, 30.0, 30.0), (), [0, 1, 2]),
+    ],
+)
+def test_the_largest_are_followed_and_keep_their_places(sizes, before, chosen):
+    number, before = torch.tensor([4, 6, 9]), torch.tensor(before, dtype=torch.long)
+    rows = largest_persons(number, torch.tensor(sizes), before, len(chosen))
+    assert rows.tolist() == chosen
+
+
+def test_one_of_two_in_the_same_clothes_is_followed_and_is_one_person():
+    """Faces at 100 and 400 that are about as large as each other, until the second one comes near."""
+    pytest.importorskip("cv2")
+    image, _ = scene((100, RED), (400, RED))
+    sizes = [(72.0, 76.0) if t // 6 % 2 else (76.0, 72.0) for t in range(36)] + [(72.0, 96.0)] * 24
+    found = torch.zeros(0, 3, dtype=torch.float64)
+
+    def faces(grey, region=None):
+        left, right = (0, 640) if region is None else (region.left, region.right)
+        return found[(found[:, 0] >= left) & (found[:, 0] < right)]
+
+    measurer = UpperBodyMeasurer(
+        load_prior("kinect-upper-body-small"),
+        hands="mean-shift",
+        face_detector=faces,
+        max_persons=1,
+    )
+    seen, followed = measurer.init().seen, []
+    for first, second in sizes:
+        found = torch.tensor([[100.0, 80.0, first], [400.0, 80.0, second]]).double()
+        view = measurer.look(seen, image)
+        seen = view.after
+        right = view.faces[:, 0] > 250
+        followed += zip(view.number.tolist(), right.tolist(), strict=True)
+    assert len(followed) >= 56 and set(followed) == {(0, False), (1, True)}
+    assert set(followed[:34]) == {(0, False)} and set(followed[-12:]) == {(1, True)}
 
 
 def test_bad_settings_are_refused():

@@ -104,6 +104,34 @@ def test_a_rate_is_asked_for(camera):
     assert fake.asked[cv2.CAP_PROP_FPS] == 60
 
 
+def test_of_a_faster_camera_frames_are_left_out(camera):
+    source, _ = camera(WARM_UP + 90, ask=12.0)
+    assert source.fps == 12
+    assert source.notes == [
+        "the camera gives 30 frames per second; 12 of them are used, as asked for"
+    ]
+    times = [frame.time for frame in source]
+    np.testing.assert_allclose(times, np.arange(len(times)) / 12, atol=0.5 / 30 + 1e-9)
+    assert len(times) == 36 and len(source.notes) == 2
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_reader_that_is_too_slow_is_told(camera, closed):
+    source, fake = camera(WARM_UP + 31)
+    for frame in source:
+        fake.now += 0.1  # at which the camera's further frames are lost
+        if closed and frame.index == 29:
+            source.close()
+            break
+    assert source.notes[0].startswith(
+        "camera 3 was read at 7.5 frames per second and taken for one of 30"
+    )
+    assert "4 times as fast as in truth" in source.notes[0] and "--fps 7.1" in source.notes[0]
+    assert len(source.notes) == 2 - closed
+    source, _ = camera(WARM_UP + 90)
+    assert len(list(source)) == 90 and len(source.notes) == 1
+
+
 def test_not_there_in_use_or_silent(camera):
     with pytest.raises(InputError, match="camera 3 cannot be opened"):
         camera(5, opened=False)

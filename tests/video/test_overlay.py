@@ -140,6 +140,16 @@ def test_persons_have_tints_that_come_round_again():
     assert close(pixel(again, poses[1, HEAD]), rgb(PERSON_TINTS[0]))
 
 
+def test_faces_have_the_tints_of_their_persons():
+    nobody = torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool)
+    faces = torch.tensor([[300.0, 200.0, 80.0], [500.0, 200.0, 80.0]])
+    image = draw_overlay(frame(), *nobody, faces=faces, face_tints=[3, 1])
+    assert close(pixel(image, torch.tensor([260.0, 200.0])), rgb(PERSON_TINTS[3]), 40)
+    assert close(pixel(image, torch.tensor([460.0, 200.0])), rgb(PERSON_TINTS[1]), 40)
+    with pytest.raises(ShapeError, match="faces"):
+        draw_overlay(frame(), *nobody, faces=faces, face_tints=[0])
+
+
 def test_faces_hands_and_labels_are_drawn_where_they_are():
     nobody = torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool)
     face = torch.tensor([[300.0, 200.0, 80.0]])

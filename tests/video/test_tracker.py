@@ -1,13 +1,14 @@
 """Persons of a video who leave, return and cross, rendered."""
 
 import sys
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from torchpose import VideoTracker, load_prior
+from torchpose import PinholeCamera, VideoTracker, load_prior
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.priors import UpperBodyPrior
@@ -20,6 +21,14 @@ FACE = 3  # the head, in `UPPER_BODY`
 @pytest.fixture(scope="module")
 def prior(small_windows_file):
     return UpperBodyPrior.load(small_windows_file)
+
+
+class Video(list):
+    """Frames with a rate."""
+
+    def __init__(self, frames, fps):
+        super().__init__(frames)
+        self.fps = fps
 
 
 def rendered(*performances):
@@ -103,6 +112,23 @@ def test_only_the_largest_face_is_followed_if_asked_for(prior, two_persons):
     assert len(people) == 1
 
 
+@pytest.mark.parametrize("edges", [False, True])
+def test_images_are_held_for_edges_alone(prior, edges):
+    there, held = set(), []
+
+    def frames():
+        for _ in range(40):
+            image = np.full((48, 64, 3), 90, np.uint8)
+            there.add(id(image))
+            weakref.finalize(image, there.discard, id(image))
+            held.append(len(there))
+            yield image
+
+    camera = PinholeCamera.from_image_size(64, 48)
+    assert VideoTracker(prior, camera, method="mkf-fixed", edges=edges)(frames()) == []
+    assert max(held) >= 32 if edges else max(held) <= 8
+
+
 def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one_person):
     shown = one_person[:30]
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", candidates=True)
@@ -174,11 +200,23 @@ def test_bad_use_is_refused(prior):
     with pytest.raises(InputError, match="max_gap"):
         VideoTracker(prior, demo_camera(), max_gap=0.0)
     tracker = VideoTracker(prior, demo_camera())
+    small = np.zeros((20, 30, 3), np.uint8)
+    with pytest.raises(
+        InputError, match="30 x 20 pixels, and the camera is for images of 640 x 480"
+    ):
+        tracker([small])
+    with pytest.raises(InputError, match="30 x 20 pixels"):
+        tracker.step(tracker.init(), small)
+    with pytest.raises(InputError, match=r"15\.08 frames per second, and the tracker is for 30"):
+        tracker(Video([], 15.08))
+    with pytest.raises(InputError, match="25 frames per second"):
+        tracker.advance(tracker.init(), Video([], 25.0))
+    assert tracker(Video([], 29.97)) == tracker(Video([], 0.0)) == []
     with pytest.raises(InputError, match="uint8"):
         tracker([np.zeros((20, 20, 3))])
     with pytest.raises(InputError, match="RGB tensor"):
         tracker(torch.zeros(1, 20, 20, 3, dtype=torch.uint8))
     smoother = VideoTracker(prior, demo_camera(), smoothing="full")
     with pytest.raises(InputError, match="smoothing"):
-        smoother.step(smoother.init(), np.zeros((20, 20, 3), np.uint8))
+        smoother.step(smoother.init(), small)
     assert tracker([]) == []

@@ -32,7 +32,8 @@ def resolve_camera(
     longer side.
 
     Args:
-        given: a TOML file or ``fx,fy,cx,cy``. name: the name of the camera in a file with several.
+        given: a TOML file, or ``fx,fy,cx,cy`` for images of the input's size.
+        name: the name of the camera in a file with several.
         size: (width, height) of the images, if known. matrix: K of the input, if known.
         source: the input, for messages.
 
@@ -41,7 +42,7 @@ def resolve_camera(
             of the input, or its focal length is not one in pixels. InputError, FileFormatError: the file.
     """
     if given:
-        camera = _of_pixels(_given_camera(given, name), given)
+        camera = _of_pixels(_given_camera(given, name, size), given)
         if size is not None and camera.image_size is not None and camera.image_size != size:
             raise CameraError(
                 f"{given}: the camera is for images of {_text(camera.image_size)}, the input is "
@@ -66,7 +67,7 @@ def resolve_camera(
     )
 
 
-def _given_camera(given: str, name: str | None) -> PinholeCamera:
+def _given_camera(given: str, name: str | None, size: tuple[int, int] | None) -> PinholeCamera:
     if Path(given).exists() or "," not in given:
         return PinholeCamera.load(given, name)
     try:
@@ -75,7 +76,7 @@ def _given_camera(given: str, name: str | None) -> PinholeCamera:
         raise CameraError(
             f"--camera must be a TOML file or four numbers fx,fy,cx,cy in pixels, got {given!r}"
         ) from error
-    return PinholeCamera(fx, fy, cx, cy)
+    return PinholeCamera(fx, fy, cx, cy, *(size or (None, None)))
 
 
 def _of_pixels(camera: PinholeCamera, source: object) -> PinholeCamera:

@@ -65,7 +65,7 @@ def track_video(
             else:
                 people, n_frames = _track_camera(tracker, source, results.stage, overlay)
             seconds = time.perf_counter() - start
-            notes += tuple(source.notes)
+        notes += tuple(source.notes)  # some of them are known once it is closed
         if not people:
             return _nobody(job.input, n_frames, notes, results.folder, options["detector"])
         facts = {
@@ -77,6 +77,7 @@ def track_video(
             "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
+        names = _names(people, source.reopenable)
         # first of all: the rest only shows them
         written = results.commit(write_people(people, results.stage))
         if pictures:
@@ -86,9 +87,9 @@ def track_video(
             if source.reopenable:
                 write_overlay(drawn, source.reopen(), people, n_frames)
             title = Path(job.input).name
-            shown = _write_report(results.stage, people, n_frames, facts, notes, title)
+            shown = _write_report(results.stage, people, names, n_frames, facts, notes, title)
             written += results.commit(shown)
-    print(_summary(people, written, facts, results.notes))
+    print(_summary(people, names, written, facts, results.notes))
     return max(report_failure(person.track) for person in people)
 
 
@@ -164,7 +165,7 @@ def _track_camera(
             writers.append(stack.enter_context(writer))
 
         def watch(image: Any, measured: Any, poses: dict[int, Any]) -> None:
-            drawn = _drawn(image, poses, 0, measured.faces)
+            drawn = _drawn(image, poses, 0, measured)
             view.show(drawn)
             if writers:
                 _record(writers, drawn)
@@ -214,26 +215,44 @@ def _first(source: "VideoSource", n_frames: int) -> Iterator[Any]:
 
 
 def _drawn(
-    image: Any, tracks: dict[int, Any], frame: int | dict[int, int], faces: Any = None
+    image: Any, tracks: dict[int, Any], frame: int | dict[int, int], measured: Any = None
 ) -> Any:
-    """Return a frame with poses drawn into it, by number of the person, from a frame of their tracks."""
+    """Return a frame with poses drawn into it, by number of the person, from a frame of their tracks.
+
+    Args:
+        measured: the measurements in the frame, whose faces are drawn.
+    """
     import torch
 
     from torchpose.video._overlay import draw_overlay
 
     at = {n: frame if isinstance(frame, int) else frame[n] for n in tracks}
+    faces: dict[str, Any] = {}
+    if measured is not None and measured.faces is not None:
+        faces = {"faces": measured.faces, "face_tints": measured.person.tolist()}
     if not tracks:
-        return draw_overlay(
-            image, torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool), faces=faces
-        )
+        nobody = torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool)
+        return draw_overlay(image, *nobody, **faces)
     joints, cov, observed = (
         torch.stack([getattr(track, name)[0, at[n]] for n, track in tracks.items()])
         for name in ("joints2d", "covariance2d", "observed")
     )
-    labels = [f"person {n + 1}" for n in tracks] if len(tracks) > 1 else None
-    return draw_overlay(
-        image, joints, cov, observed, faces=faces, labels=labels, tints=list(tracks)
-    )
+    labels = [_name(n) for n in tracks] if len(tracks) > 1 else None
+    return draw_overlay(image, joints, cov, observed, labels=labels, tints=list(tracks), **faces)
+
+
+def _name(number: int) -> str:
+    return f"person {number + 1}"
+
+
+def _names(people: list["TrackedPerson"], longest_first: bool) -> list[str]:
+    """Return the names of the persons in the overlay.
+
+    Args:
+        longest_first: whether it was drawn once it was known who was seen longest; while a camera runs,
+            only the order of appearance is.
+    """
+    return [_name(place if longest_first else p.number) for place, p in enumerate(people)]
 
 
 def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
@@ -247,6 +266,7 @@ def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
 def _write_report(
     out: Path,
     people: list["TrackedPerson"],
+    names: list[str],
     n_frames: int,
     facts: dict[str, str],
     notes: tuple[str, ...],
@@ -265,6 +285,7 @@ def _write_report(
         notes=notes,
         first_frames=[person.first_frame for person in people],
         n_frames=n_frames,
+        labels=names,
     )
     return [*written, out / "report.html"]
 
@@ -302,14 +323,18 @@ def _nobody(
 
 
 def _summary(
-    people: list["TrackedPerson"], written: list[Path], facts: dict[str, str], notes: Sequence[str]
+    people: list["TrackedPerson"],
+    names: list[str],
+    written: list[Path],
+    facts: dict[str, str],
+    notes: Sequence[str],
 ) -> str:
     """Return the summary that is printed: the persons, and the poses of the first."""
     first = summary(people[0].track, written, facts, notes)
     if len(people) == 1:
         return first
     others = [
-        f"person {place}: frames {p.first_frame} to {p.first_frame + len(p) - 1}"
-        for place, p in enumerate(people, 1)
+        f"{name}: frames {p.first_frame} to {p.first_frame + len(p) - 1}, in poses{person_suffix(place)}.npz"
+        for place, (name, p) in enumerate(zip(names, people, strict=True), 1)
     ]
-    return "\n".join([*others, "of person 1:", first])
+    return "\n".join([*others, f"of {names[0]}:", first])

@@ -1,6 +1,6 @@
 """Detect foreground against a static background, and motion between frames."""
 
-from functools import cache
+import threading
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ _ANOTHER, _SAME = 30, 16  # grey levels between what is something else, and with
 _UNKNOWN = (255, 0, 255)  # colour for unknown background
 # Differences from the last frame and from the median, steps of Lab: noise up to the first, range above it.
 _DIFFERENCE, _UNUSUAL = (2.0, 20.0), (4.0, 30.0)
+_OF_THREAD = threading.local()
 
 
 def person_region(
@@ -359,11 +360,15 @@ def dense_flow(
     return torch.from_numpy(flow), torch.from_numpy(cells).div_(EVIDENCE)
 
 
-@cache
 def _method() -> Any:
-    """Return OpenCV's DIS at half the resolution, made once: making it takes longer than a frame."""
+    """Return OpenCV's DIS at half the resolution, made once in a thread: making it takes longer than a frame.
+
+    It has buffers that calls in several threads would share.
+    """
     import cv2
 
-    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
-    method.setFinestScale(1)
-    return method
+    if not hasattr(_OF_THREAD, "flow"):
+        method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+        method.setFinestScale(1)
+        _OF_THREAD.flow = method
+    return _OF_THREAD.flow

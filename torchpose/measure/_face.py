@@ -33,6 +33,7 @@ _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken a
 _USUAL = 40.0  # size above which faces are searched for first, pixels
 _CLEAR = 26.0  # size to which the smallest face of a search is enlarged, pixels
 _STRICTER = 1  # boxes more that must agree in an enlarged image
+_LEAST = 4.0  # size below which a track ends: it was lost while it became smaller, pixels
 _BRIGHT, _MOST_GAIN = 160.0, 6.0  # grey of the brightest parts of an image that needs no gain
 _TILT = 25.0  # degrees by which an image is turned to find tilted faces
 # Where a far smaller face is a pattern on somebody's head or clothes, in sizes of that person's face.
@@ -203,7 +204,8 @@ class FaceTracker(nn.Module):
     A detection is associated with the nearest track, by Euclidean distance over (x, y, size), if that
     is within `gate` sizes of the face; otherwise it starts a track. A track is used once it has
     `min_hits`. It loses a third of a hit for every missed detection, and ends when none is left. All
-    deviations below are in sizes of the face.
+    deviations below are in sizes of the face. A track ends as well when its predicted size falls below 4
+    pixels, as that of a face does which is lost while it moves away.
 
     Args:
         detector: by default `HaarFaceDetector`.
@@ -327,9 +329,9 @@ class FaceTracker(nn.Module):
         """Return the detections about a known face, scaled to the size `detail`, tilted if not upright."""
         region = _region(face, image.shape)
         part = image[region.top : region.bottom, region.left : region.right]
-        if part.size == 0:
-            return torch.zeros(0, 3, dtype=torch.float64)
         scale = self.detail / max(face[2], 1.0)
+        if round(scale * min(part.shape)) < 1:  # the face is outside, or all but outside
+            return torch.zeros(0, 3, dtype=torch.float64)
         if 1 / _SAME_SIZE < scale < _SAME_SIZE:
             scale, found = 1.0, self.detector(image, region)
             found = found - found.new_tensor([region.left, region.top, 0])
@@ -346,9 +348,11 @@ class FaceTracker(nn.Module):
         noise = torch.diag_embed(spread)
         offset = torch.zeros_like(tracks.mean)
         mean, cov = kalman_predict(tracks.mean, tracks.cov, self.matrix, offset, noise)
-        return tracks._replace(
+        predicted = tracks._replace(
             mean=mean, cov=cov, age=tracks.age + 1, unseen=tracks.unseen + 1, frame=tracks.frame + 1
         )
+        lasting = mean[:, 2] >= _LEAST
+        return predicted if bool(lasting.all()) else _some(predicted, lasting)
 
     def update(self, tracks: FaceTracks, found: Float[Tensor, "n 3"]) -> FaceTracks:
         """Update predicted tracks with the detections (x, y, size) of their frame; start and end tracks."""
@@ -387,6 +391,12 @@ class FaceTracker(nn.Module):
         return torch.diag_embed((self.std * size[:, None]).square().expand(-1, 3))
 
 
+def _some(tracks: FaceTracks, rows: Bool[Tensor, " N"]) -> FaceTracks:
+    """Return some of the tracks."""
+    fields = (value[rows] if isinstance(value, Tensor) else value for value in tracks)
+    return FaceTracks(*fields)  # type: ignore[arg-type]
+
+
 def _whole(image: Image, sizes: Region, scale: float) -> Region:
     """Return a whole image as the region of a search, for the sizes of another region, scaled."""
     smallest, largest = scale * sizes.smallest, scale * sizes.largest
@@ -410,16 +420,12 @@ def _turned_search(
 
 
 def _region(face: list[float], shape: tuple[int, ...]) -> Region:
-    x, y, size = face[0], face[1], max(face[2], 1.0)
+    """Return the part of the image about a face, empty if the face is outside, and sizes near its own."""
+    size = max(face[2], 1.0)
     reach = _ROI * size
-    return Region(
-        max(0, int(x - reach)),
-        max(0, int(y - reach)),
-        min(shape[1], int(x + reach)),
-        min(shape[0], int(y + reach)),
-        _SMALLER * size,
-        _LARGER * size,
-    )
+    left, right = (min(max(0, int(face[0] + side)), shape[1]) for side in (-reach, reach))
+    top, bottom = (min(max(0, int(face[1] + side)), shape[0]) for side in (-reach, reach))
+    return Region(left, top, right, bottom, _SMALLER * size, _LARGER * size)
 
 
 def _on_somebody(faces: Float[Tensor, "N 3"], known: Bool[Tensor, " N"]) -> Bool[Tensor, " N"]:

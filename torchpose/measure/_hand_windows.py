@@ -148,7 +148,7 @@ class HandWindows:
         colours = None if self.network is None else self.network.see_colours(lab, inside, near)
         mask = None if foreground is None else cut_mask(foreground, anchors)
         maps = torch.stack([moving, unusual], 1)
-        if bool((inside < 1).any()):
+        if float(inside.min()) < 1:
             maps = maps * inside[:, None]
         over_hands = self.likelihood.over_hands(maps)
         log_prior, elbow = self._prior(near)

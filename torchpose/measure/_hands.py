@@ -283,7 +283,7 @@ class HandTracker(nn.Module):
         skin[:, rows, columns] *= 1 - hidden
         if view.foreground is not None:
             skin = skin * view.foreground
-        if bool((inside < 1).any()):
+        if float(inside.min()) < 1:
             skin = skin * inside + self.likelihood.unknown * (1 - inside)
         means = self.likelihood.means(skin, view.motion)
         found = None

@@ -26,7 +26,7 @@ from torchpose.measure._detectors.protocol import (
     KeypointDetector,
     checked_detections,
 )
-from torchpose.measure._persons import PersonRegister, Persons
+from torchpose.measure._persons import PersonRegister, Persons, largest_persons
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 
@@ -66,11 +66,16 @@ class FrameKeypoints(NamedTuple):
 
 
 class KeypointState(NamedTuple):
-    """Holds the tracks of the persons, who they are, and the number of frames before."""
+    """Holds the tracks of the persons, who they are, and the number of frames before.
+
+    Attributes:
+        followed: numbers of those who count [n].
+    """
 
     tracks: PersonTracks
     persons: Persons
     frame: int
+    followed: Int[Tensor, " n"]
 
 
 class KeypointMeasurer:
@@ -82,7 +87,8 @@ class KeypointMeasurer:
 
     Args:
         detector: of keypoints. fps: frames per second.
-        max_persons: the largest are taken; None takes all.
+        max_persons: at most so many persons at a time are measured, the largest; who is measured gives way
+            to somebody a fifth larger. None takes all.
         min_confidence: of a keypoint, below which it counts as missing.
         name: of the detector, in messages.
 
@@ -123,7 +129,8 @@ class KeypointMeasurer:
         reset = getattr(self.detector, "reset", None)
         if callable(reset):
             reset()
-        return KeypointState(no_tracks(len(self.names)), self.register.init(), 0)
+        persons = self.register.init()
+        return KeypointState(no_tracks(len(self.names)), persons, 0, persons.last_seen)
 
     def step(self, state: KeypointState, image: Image) -> tuple[KeypointState, FrameKeypoints]:
         """Return the next state and the keypoints of the next frame.
@@ -141,11 +148,12 @@ class KeypointMeasurer:
         before = self._scale(state.tracks.keypoints)[1]
         tracks, owner = associate(state.tracks, found.keypoints, before, self._upper)
         persons, number = self._number(state, tracks, image)
-        chosen = self._chosen(number[owner], found)
+        followed = self._followed(number, tracks, state.followed)
+        chosen = torch.nonzero(torch.isin(number[owner], followed)).flatten()
         found, number = _rows(found, chosen), number[owner][chosen]
         size = self._scale(found.keypoints)[1]
         measured = FrameKeypoints(number, found.keypoints, found.confidence, size, found.absent)
-        return KeypointState(tracks, persons, state.frame + 1), measured
+        return KeypointState(tracks, persons, state.frame + 1, followed), measured
 
     def _detect(self, tracks: PersonTracks, image: Image) -> Detections:
         """Return all keypoints of a frame."""
@@ -189,7 +197,7 @@ class KeypointMeasurer:
         keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
         there = sure[:, self._upper].sum(1) >= least_seen(len(self._upper))
         confidence = torch.where(sure, found.confidence, 0.0)
-        beyond = found.keypoints.isfinite().all(-1) & ~inside
+        beyond = found.keypoints.isfinite().all(-1) & ~inside & (found.confidence > 0)
         absent = torch.where(beyond, _BEYOND, torch.nan).to(confidence)
         return _Sure(keypoints[there], confidence[there], absent[there])
 
@@ -207,13 +215,19 @@ class KeypointMeasurer:
         numbers[present] = number
         return persons, numbers
 
-    def _chosen(self, number: Int[Tensor, " N"], found: "_Sure") -> Int[Tensor, " n"]:
-        """Return the rows of the persons who count, the largest if there are too many."""
-        rows = torch.nonzero(number >= 0).flatten()
-        if self.max_persons is None or len(rows) <= self.max_persons:
-            return rows
-        size = self._scale(found.keypoints[rows])[1]
-        return rows[size.argsort(descending=True)[: self.max_persons].sort().values]
+    def _followed(
+        self, number: Int[Tensor, " P"], tracks: PersonTracks, before: Int[Tensor, " n"]
+    ) -> Int[Tensor, " m"]:
+        """Return the numbers of the persons who count, the largest if there are too many.
+
+        Somebody who is not detected for a moment keeps the place.
+        """
+        present = number >= 0
+        number = number[present]
+        if self.max_persons is None:
+            return number
+        size = self._scale(tracks.keypoints[present])[1]
+        return number[largest_persons(number, size, before, self.max_persons)]
 
 
 class _Sure(NamedTuple):

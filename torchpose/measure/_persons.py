@@ -15,6 +15,7 @@ __all__ = [
     "PersonRegister",
     "Persons",
     "clothes_colours",
+    "largest_persons",
     "match_rows",
     "match_states",
     "measure_by_scale",
@@ -25,6 +26,7 @@ State = TypeVar("State", bound=tuple[Any, ...])
 _BINS = 8
 _CLOTHES = (0.8, 1.3, 2.6)  # half the width, top and bottom below the face, in its sizes
 _LEARNING = 0.05
+_CLEARLY = 1.2  # times as large as somebody who is followed, from which another one takes the place
 
 
 class Persons(NamedTuple):
@@ -62,6 +64,22 @@ def match_states(state: State, fresh: State, identity: Int[Tensor, " N"]) -> Sta
     rows = match_rows(known.identity, identity)
     matched: Any = _map(lambda old, new: torch.cat([old, new])[rows], state, fresh)
     return matched._replace(identity=identity.clone())  # type: ignore[no-any-return]
+
+
+def largest_persons(
+    number: Int[Tensor, " N"], size: Float[Tensor, " N"], before: Int[Tensor, " n"], most: int
+) -> Int[Tensor, " M"]:
+    """Return the rows of the largest persons; who was followed before gives way to a clearly larger one.
+
+    Args:
+        number, size: of all who are present. before: numbers of those followed so far. most: M, at most.
+
+    >>> number, size = torch.tensor([0, 1, 2]), torch.tensor([30.0, 33.0, 40.0])
+    >>> largest_persons(number, size, torch.tensor([0]), 2).tolist()
+    [0, 2]
+    """
+    worth = torch.where(torch.isin(number, before), _CLEARLY * size, size)
+    return worth.argsort(descending=True, stable=True)[:most].sort().values
 
 
 def take_rows(state: State, rows: slice | Tensor) -> State:
@@ -104,7 +122,8 @@ def _histogram(image: Image, face: list[float]) -> np.ndarray:
     rows, columns = image.shape[:2]
     half, top, bottom = (share * size for share in _CLOTHES)
     left, right = int(max(0, x - half)), int(min(columns, x + half))
-    part = image[int(max(0, y + top)) : int(min(rows, y + bottom)), max(0, left) : max(0, right)]
+    above, below = int(max(0, y + top)), int(min(rows, y + bottom))
+    part = image[above : max(0, below), max(0, left) : max(0, right)]
     step = max(1, int(size / 20))
     bins = (part[::step, ::step].reshape(-1, 3) >> 5).astype(np.int64)
     counts = np.bincount(bins @ np.array([64, 8, 1]), minlength=_BINS**3).astype(np.float64)

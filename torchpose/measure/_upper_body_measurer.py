@@ -21,7 +21,13 @@ from torchpose.measure._hand_windows import HandView, HandWindowState
 from torchpose.measure._hands import HandBeliefs, HandTracker
 from torchpose.measure._head import FACE_OFFSETS, WITHOUT_ELBOWS, HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
-from torchpose.measure._persons import PersonRegister, Persons, measure_by_scale, take_rows
+from torchpose.measure._persons import (
+    PersonRegister,
+    Persons,
+    largest_persons,
+    measure_by_scale,
+    take_rows,
+)
 from torchpose.measure._skin import SkinState, rgb_to_lab
 from torchpose.measure._torso_elbows import Elbows, clothes_likelihood, elbows_from_torso
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -87,13 +93,14 @@ class SeenPersons(NamedTuple):
 
     Attributes:
         faces, persons: tracked and numbered. windows: about the faces; None for mean shift.
-        frame: number of frames before.
+        frame: number of frames before. followed: numbers of those who were measured last [n].
     """
 
     faces: FaceTracks
     persons: Persons
     windows: HandWindowState | None
     frame: int
+    followed: Int[Tensor, " n"]
 
 
 class PersonsView(NamedTuple):
@@ -134,7 +141,9 @@ class UpperBodyMeasurer(nn.Module):
         background: whether to detect the foreground, for a static camera.
         elbows: whether to measure elbows: by the network, or without one where the torso with its sleeves
             is widest. None measures them if hands are "learnt".
-        face_detector: by default Haar's. max_persons: the largest faces are taken.
+        face_detector: by default Haar's.
+        max_persons: at most so many persons at a time are measured, those with the largest faces; who is
+            measured gives way to a face that is a fifth larger.
         head_neck: offsets of head and neck from the face; by default the neck is higher if a network
             measures elbows.
 
@@ -185,7 +194,8 @@ class UpperBodyMeasurer(nn.Module):
         """Return the state before the first frame, and reset the background model."""
         if self.background is not None:
             self.background.reset()
-        seen = SeenPersons(self.face_tracker.init(), self.register.init(), None, 0)
+        persons = self.register.init()
+        seen = SeenPersons(self.face_tracker.init(), persons, None, 0, persons.last_seen)
         if isinstance(self.hand_tracker, HandTracker):
             windows, beliefs = self.hand_tracker.init()
             return MeasurerState(seen._replace(windows=windows), beliefs)
@@ -211,11 +221,14 @@ class UpperBodyMeasurer(nn.Module):
         persons, number = self.register.step(
             seen.persons, image, faces, identity, seen.frame, detected
         )
+        if self.max_persons is not None:
+            rows = largest_persons(number, faces[:, 2], seen.followed, self.max_persons)
+            faces, face_cov, number = faces[rows], face_cov[rows], number[rows]
         foreground = None if self.background is None else self.background.step(image, faces)
         windows, hands = seen.windows, None
         if isinstance(self.hand_tracker, HandTracker) and windows is not None:
             windows, hands = self.hand_tracker.look(windows, image, faces, number, foreground)
-        after = SeenPersons(tracks, persons, windows, seen.frame + 1)
+        after = SeenPersons(tracks, persons, windows, seen.frame + 1, number)
         return PersonsView(after, faces, face_cov, number, foreground, hands)
 
     def _follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
@@ -318,9 +331,6 @@ class UpperBodyMeasurer(nn.Module):
         """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen."""
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
         rows = torch.nonzero(used).flatten()
-        if self.max_persons is not None and len(rows) > self.max_persons:
-            largest = tracks.mean[rows, 2].argsort(descending=True)[: self.max_persons]
-            rows = rows[largest.sort().values]
         faces = scaled_back(tracks.mean[rows, :3], scale)
         cov = tracks.cov[rows, :3, :3] / scale**2
         return faces, cov, tracks.identity[rows], tracks.unseen[rows]

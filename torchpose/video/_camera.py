@@ -1,5 +1,6 @@
 """Read cameras by OpenCV."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
@@ -13,6 +14,8 @@ __all__ = ["CameraSource", "Capture"]
 _WARM_UP = 10  # frames that are discarded: exposure settles, and the rate is measured
 _PATIENCE = 5  # reads without a frame, one after another, before a camera counts as unplugged
 _PAUSE = 0.02  # seconds between them
+_WRONG = 0.05  # share by which two rates may differ
+_TELLING = 2.0  # seconds of frames that tell at what rate they are read
 
 
 @runtime_checkable
@@ -34,10 +37,12 @@ class CameraSource(VideoSource):
     """Yields frames of a camera until it is closed or unplugged.
 
     The rate is measured over the first frames, which are discarded while the exposure settles. The times
-    of the frames are those of the clock.
+    of the frames are those of the clock. Only the newest frame waits, so that a slow reader misses some:
+    once the source is closed, a note says at what rate frames were read if that was another one.
 
     Args:
-        index: number of the camera, from 0. fps: the rate to ask the camera for.
+        index: number of the camera, from 0.
+        fps: the rate to ask the camera for; where it gives more, frames are left out.
         capture: returns the reader of an index; `cv2.VideoCapture` by default.
 
     Raises:
@@ -51,6 +56,7 @@ class CameraSource(VideoSource):
         capture: Callable[[int], Capture] | None = None,
     ) -> None:
         super().__init__(f"camera {index}")
+        self._early = math.inf  # seconds by which a frame may come before its time
         if index < 0:
             raise InputError(f"the number of a camera is 0 or more, got {index}")
         if fps is not None:
@@ -90,6 +96,11 @@ class CameraSource(VideoSource):
                 "which are used; little light makes cameras slow"
             )
             self.fps = measured
+        if fps is not None and self.fps > (1 + _WRONG) * fps:
+            self.notes.append(
+                f"the camera gives {self.fps:.4g} frames per second; {fps:.4g} of them are used, as asked for"
+            )
+            self.fps, self._early = fps, 0.5 / self.fps
 
     def _grab(self) -> Any:
         for attempt in range(_PATIENCE):
@@ -103,7 +114,22 @@ class CameraSource(VideoSource):
     def _read(self) -> Iterator[VideoFrame]:
         import cv2
 
-        start, index = None, 0
+        count, last = 0, 0.0
+        try:
+            for image, seconds in self._images():
+                if seconds < count / self.fps - self._early:
+                    continue
+                count, last = count + 1, seconds
+                yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, count - 1)
+        finally:  # also if it is closed
+            self._note_rate(count, last)
+        self.notes.append(
+            f"{self.name} gave no more frames after {count}: unplugged, or taken by another program"
+        )
+
+    def _images(self) -> Iterator[tuple[Any, float]]:
+        """Yield what the camera gives, and the seconds since the first image."""
+        start = None
         while (image := self._grab()) is not None:
             now = time.monotonic()
             start = now if start is None else start
@@ -112,11 +138,20 @@ class CameraSource(VideoSource):
                     f"{self.name}: expected frames of {self.size[0]}x{self.size[1]}, got an array "
                     f"of shape {list(image.shape)}"
                 )
-            yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), now - start, index)
-            index += 1
-        self.notes.append(
-            f"{self.name} gave no more frames after {index}: unplugged, or taken by another program"
-        )
+            yield image, now - start
+
+    def _note_rate(self, count: int, seconds: float) -> None:
+        """Add a note if frames were read at another rate than was assumed."""
+        if seconds < _TELLING:
+            return
+        rate = (count - 1) / seconds
+        if abs(rate / self.fps - 1) > _WRONG:
+            reached = f"{(1 - _WRONG) * rate:.2g}"
+            self.notes.append(
+                f"{self.name} was read at {rate:.3g} frames per second and taken for one of {self.fps:.4g}: "
+                f"what was made of it moves {self.fps / rate:.2g} times as fast as in truth; ask for a rate "
+                f"that is reached (fps={reached}, --fps {reached})"
+            )
 
     def _release(self) -> None:
         self._capture.release()

@@ -44,7 +44,12 @@ class SeenFrame(NamedTuple):
 
 
 class MeasuredBlock(NamedTuple):
-    """Holds some frames, the measurements in each, and the state of the measurer after the last."""
+    """Holds the measurements in some frames, and the state of the measurer after the last.
+
+    Attributes:
+        images: the frames, if anything uses them; else none. found: the measurements in each.
+        state: after the last.
+    """
 
     images: list[Image]
     found: list[Found]
@@ -186,21 +191,23 @@ def look_ahead(measurer: Measurer, state: Any, images: Iterable[Image]) -> Itera
 
 
 def measure_blocks(
-    measurer: Measurer, state: Any, frames: Iterable[SeenFrame], size: int
+    measurer: Measurer, state: Any, frames: Iterable[SeenFrame], size: int, keep: bool
 ) -> Generator[MeasuredBlock, None, None]:
     """Yield blocks of measured frames, which the poses before do not change.
 
     Args:
         measurer: measures the persons. state: its state before the frames. frames: from `look_ahead`.
         size: the number of frames of a block; the last one may be shorter.
+        keep: whether blocks hold their images.
     """
-    images, found = [], []
+    images: list[Image] = []
+    found: list[Found] = []
     for frame in frames:
         state, one = measurer.step(state, frame)
-        images.append(frame.image)
+        images += [frame.image] if keep else []
         found.append(one)
-        if len(images) == size:
+        if len(found) == size:
             yield MeasuredBlock(images, found, state)
             images, found = [], []
-    if images:
+    if found:
         yield MeasuredBlock(images, found, state)

@@ -157,6 +157,7 @@ def draw_overlay(
     hand_covariance: Float[Tensor, "N 2 2 2"] | None = None,
     labels: Sequence[str] | None = None,
     tints: Sequence[int] | None = None,
+    face_tints: Sequence[int] | None = None,
     level: float = 0.9,
 ) -> Image:
     """Return a copy of a frame with P persons and their measurements drawn on it.
@@ -170,11 +171,12 @@ def draw_overlay(
         poses2d: joints in the order of `UPPER_BODY`, pixels [P, 8, 2].
         covariance2d: theirs, pixels squared [P, 8, 2, 2]; None draws no ellipses.
         observed: True where the joint was measured [P, 8].
-        faces: centre and size of the measured faces, pixels [F, 3]; face i has the tint of person i.
+        faces: centre and size of the measured faces, pixels [F, 3].
         hands: measured hands, left and right [N, 2, 2], pixels, drawn as crosses below the joints.
         hand_covariance: theirs [N, 2, 2, 2], drawn as ellipses of probability `level`.
         labels: a word or two for each person, over the head; ASCII.
         tints: index into `PERSON_TINTS` of each person, such as its number; by default in order.
+        face_tints: the same for each face; by default face i has the tint of person i.
         level: probability of the ellipses.
 
     Returns:
@@ -183,7 +185,7 @@ def draw_overlay(
     Raises:
         InputError: not an RGB image of uint8, labels or tints of another number than persons, or a
             level outside (0, 1).
-        ShapeError: tensors of other shapes.
+        ShapeError: tensors of other shapes, or another number of faces than of their tints.
 
     >>> frame = np.zeros((48, 64, 3), dtype=np.uint8)
     >>> nobody = torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool)
@@ -194,11 +196,13 @@ def draw_overlay(
     canvas = np.array(image, order="C")
     pen = Pen(canvas)
     numbers = range(len(poses2d)) if tints is None else tints
-    own = [rgb(PERSON_TINTS[n % len(PERSON_TINTS)]) for n in numbers]
+    own = _tints_of(numbers)
     if faces is not None:
-        check_shape("faces", faces, [None, 3])
-        for i, face in enumerate(faces.tolist()):
-            pen.box(face, own[i] if i < len(own) else rgb(PERSON_TINTS[0]))
+        check_shape("faces", faces, [None if face_tints is None else len(face_tints), 3])
+        others = [rgb(PERSON_TINTS[0])] * len(faces)
+        colors = (own + others)[: len(faces)] if face_tints is None else _tints_of(face_tints)
+        for face, color in zip(faces.tolist(), colors, strict=True):
+            pen.box(face, color)
     if hands is not None:
         _draw_hands(pen, hands, hand_covariance, level)
     points = poses2d.tolist()
@@ -216,6 +220,10 @@ def draw_overlay(
         if labels is not None:
             pen.label(labels[person], points[person], _HEAD, own[person])
     return canvas
+
+
+def _tints_of(numbers: Sequence[int]) -> list[Color]:
+    return [rgb(PERSON_TINTS[n % len(PERSON_TINTS)]) for n in numbers]
 
 
 def _draw_hands(pen: Pen, hands: Tensor, covariance: Tensor | None, level: float) -> None:

@@ -24,7 +24,7 @@ def open_video(
             such path exists.
         kind: "file", "folder" or "camera", to say which; None finds out.
         fps: frames per second. A file is resampled to it, a folder is taken to have it (30 without),
-            a camera is asked for it.
+            a camera is asked for it, and frames of a faster one are left out.
 
     Returns:
         Frames and what is known about them; close it, or use it in a `with` statement.

@@ -63,6 +63,7 @@ Watcher = Callable[[Image, Found, dict[int, PoseTrack]], None]
 """Is called with a frame, its measurements, and the poses of the persons in it by number."""
 
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
+_SAME_RATE = 0.01  # share by which the rate of a video may differ from that of the tracker
 _BLOCK = 32  # frames of a recording that are filtered together
 
 
@@ -110,8 +111,9 @@ class VideoTracker(nn.Module):
 
     Args:
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
-        camera: the camera that took the video.
-        fps: the number of frames per second. All frames are taken to be equally far apart.
+        camera: the camera that took the video. Frames must have its image size, if it has one.
+        fps: the number of frames per second. All frames are taken to be equally far apart. A video that
+            knows its rate must have this one.
         hands: the hand tracker: "learnt" (default), "grid" (without its network) or "mean-shift", the
             paper's method.
         background: detect the foreground, for a static camera.
@@ -122,7 +124,8 @@ class VideoTracker(nn.Module):
         candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then
             measured and filtered in turn, which is slower.
         face_detector: the detector of faces; by default Haar's.
-        max_persons: track only the N largest faces, or persons of a detector.
+        max_persons: measure at most N persons at a time: the largest faces, or persons of a detector. One who
+            is measured gives way only to somebody a fifth larger, and counts as one who left.
         head_neck: the offsets of head and neck from the face; see `UpperBodyMeasurer`.
         detector: find keypoints with a detector, in place of faces, skin and hands: a model in ONNX
             (.onnx), a pose landmarker of MediaPipe (.task), or package:factory, which Python imports and
@@ -239,7 +242,7 @@ class VideoTracker(nn.Module):
             The next state, and the persons seen within the last `max_gap`.
 
         Raises:
-            InputError: another kind of image, or a tracker that smooths.
+            InputError: an image of another kind or another size than the camera's, or a tracker that smooths.
         """
         state, tracked = self.advance(state, [image])
         last = {number: tracked[number][-1] for number in state.streams}
@@ -258,18 +261,19 @@ class VideoTracker(nn.Module):
             poses, each with the place of its first frame (`start`).
 
         Raises:
-            InputError: another kind of image, or a tracker that smooths.
+            InputError: an image of another kind or another size than the camera's, a video with another rate
+                than `fps`, or a tracker that smooths.
         """
         if self.smoother is not None:
             raise InputError("a camera is tracked frame by frame: expected smoothing=None")
-        seen = look_ahead(self._measurer, state.measurer, _images(images))
+        seen = look_ahead(self._measurer, state.measurer, self._images(images))
         tracked: dict[int, list[TrackedBlock]] = {}
         place, last = 0, state
         for after, block, poses in self._blocks(state, seen, _BLOCK):
             for number, parts in poses.items():
                 placed = (part._replace(start=place + part.start) for part in parts)
                 tracked.setdefault(number, []).extend(placed)
-            place, last = place + len(block.images), after
+            place, last = place + len(block.found), after
         return last, tracked
 
     def forward(
@@ -293,22 +297,34 @@ class VideoTracker(nn.Module):
             The persons who were seen for half a second or longer, the longest seen first.
 
         Raises:
-            InputError: another kind of image. OutputError: the disk is full.
+            InputError: an image of another kind or another size than the camera's, or a video with another
+                rate than `fps`. OutputError: the disk is full.
         """
         recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
         start, size = self.init(), _BLOCK if watch is None else 1
-        ahead = prefetch(look_ahead(self._measurer, start.measurer, _images(frames)))
+        images = self._images(frames)
+        ahead = prefetch(look_ahead(self._measurer, start.measurer, images))
         with (
             closing(ahead) as seen,  # no thread reads on when the caller gets an error
             closing(self._blocks(start, seen, size, self._measurer.heavy)) as blocks,
             tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
         ):
             for state, block, tracked in blocks:
-                recording.append(tracked, len(block.images))
-                bar.update(len(block.images))
+                recording.append(tracked, len(block.found))
+                bar.update(len(block.found))
                 if watch is not None:
                     watch(block.images[-1], block.found[-1], dict(state.poses))
         return recording.finish(self.smoother)
+
+    def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[Image]:
+        """Return the images of frames, which may have more to them, once their rate is known to be `fps`."""
+        rate = getattr(frames, "fps", None)
+        if rate and abs(rate / self.fps - 1) > _SAME_RATE:
+            raise InputError(
+                f"the video has {rate:g} frames per second, and the tracker is for {self.fps:g}; "
+                f"make the tracker with fps={rate:g}, or open the video with fps={self.fps:g}"
+            )
+        return _images_of_size(frames, self.tracker.camera.image_size)
 
     @property
     def _measurer(self) -> Measurer:
@@ -334,7 +350,10 @@ class VideoTracker(nn.Module):
                 state, tracked = self._follow(state, block)
                 yield state, block, tracked
             return
-        blocks = measure_blocks(measurer, state.measurer, seen, size)
+        keep = (
+            size == 1 or self.stream.association is not None
+        )  # frames are watched, or their edges
+        blocks = measure_blocks(measurer, state.measurer, seen, size, keep)
         with closing(prefetch(blocks, 1) if ahead else blocks) as measured:
             for block in measured:
                 state, tracked = self._follow(state, block)
@@ -398,10 +417,19 @@ def as_image(image: Any) -> Image:
     return np.asarray(image)
 
 
-def _images(frames: Iterable[Any] | Tensor) -> Iterator[Image]:
-    """Yield the images of frames, which may have more to them than their image."""
+def _images_of_size(
+    frames: Iterable[Any] | Tensor, size: tuple[int, int] | None
+) -> Iterator[Image]:
+    """Yield the images of frames, each of the camera's size (width, height) if that is known."""
     for frame in frames:
-        yield as_image(getattr(frame, "image", frame))
+        image = as_image(getattr(frame, "image", frame))
+        height, width = image.shape[:2]
+        if size is not None and size != (width, height):
+            raise InputError(
+                f"a frame is of {width} x {height} pixels, and the camera is for images of "
+                f"{size[0]} x {size[1]}; give the camera of the frames"
+            )
+        yield image
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
