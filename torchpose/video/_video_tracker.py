@@ -350,9 +350,8 @@ class VideoTracker(nn.Module):
                 state, tracked = self._follow(state, block)
                 yield state, block, tracked
             return
-        keep = (
-            size == 1 or self.stream.association is not None
-        )  # frames are watched, or their edges
+        # edges of arms are looked for in images, and who watches sees them
+        keep = size == 1 or self.stream.association is not None
         blocks = measure_blocks(measurer, state.measurer, seen, size, keep)
         with closing(prefetch(blocks, 1) if ahead else blocks) as measured:
             for block in measured:
@@ -423,10 +422,10 @@ def _images_of_size(
     """Yield the images of frames, each of the camera's size (width, height) if that is known."""
     for frame in frames:
         image = as_image(getattr(frame, "image", frame))
-        height, width = image.shape[:2]
-        if size is not None and size != (width, height):
+        own = image.shape[1::-1]
+        if size is not None and len(own) == 2 and own != size:
             raise InputError(
-                f"a frame is of {width} x {height} pixels, and the camera is for images of "
+                f"a frame is of {own[0]} x {own[1]} pixels, and the camera is for images of "
                 f"{size[0]} x {size[1]}; give the camera of the frames"
             )
         yield image
