@@ -31,7 +31,7 @@ _GONE_TIME = 1.0  # seconds without keypoints after which a person has left
 _ALONE_TIME = 0.25  # seconds with one camera, after which its keypoints may begin somebody else
 _SAME = 0.15  # metres between joints, on average, below which two persons are one
 _SAME_TIME = 0.2  # seconds of that
-_DOUBT = 9.0  # factor of the variance of keypoints of a camera that nobody's body explains
+_DOUBT = 25.0  # factor of the variance of keypoints of a camera that nobody's body explains
 _LEAST_INLIERS = 0.5  # share of the keypoints of a start that must be those of a body
 
 
