@@ -41,6 +41,7 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KEYPOINT_METHOD,
     KeypointBodyTracker,
 )
+from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 from torchpose.whole_body._keypoints.people_body_tracker import PeopleBodyTracker
 from torchpose.whole_body._keypoints.people_tracker import PeopleStream
@@ -299,8 +300,8 @@ class BodyTracker(nn.Module):
             they were found.
 
         Raises:
-            NobodySeenError: by all cameras in any frame, or no keypoint. InputError: silhouettes that are not
-            bool, or lengths outside 1..T.
+            NobodySeenError: by all cameras in any frame, or too few keypoints. InputError: silhouettes that
+            are not bool, or lengths outside 1..T.
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
@@ -344,13 +345,8 @@ class BodyTracker(nn.Module):
             there, later = begun + len(poses), sum(1 for _ in source)
             check_lengths(lengths, 1, there + later, lengths.device)
             poses = repeat_last(poses, later)
-        if begun:
-            unseen = (
-                "not all cameras saw somebody"
-                if measured is None
-                else "too few keypoints were given"
-            )
-            poses.notes += (f"the first {begun} frames, in which {unseen}, have no pose",)
+        unseen = "not all cameras saw somebody" if measured is None else TOO_FEW
+        poses.notes += late_note(begun, unseen)
         return poses
 
     @takes_former_arguments
@@ -450,8 +446,9 @@ class BodyTracker(nn.Module):
             keypoints, confidence, names, covariance, persons: of one frame, as in `forward`.
 
         Returns:
-            The next state, and the `BodyTrack` of this one frame. With `persons` a list of those who are
-            confirmed: a person is from the third frame on, and not earlier than a tenth of a second.
+            The next state, and the `BodyTrack` of this one frame. Until "kalman" has found the person, its
+            poses are NaN and `coasting` is True. With `persons` a list of those who are confirmed: a person
+            is from the third frame on, and not earlier than a tenth of a second.
 
         Raises:
             ShapeError, InputError, CameraError: as `forward`.

@@ -121,6 +121,15 @@ def test_persons_who_are_there_begin_anew_where_there_is_no_room_for_others():
     assert PeopleTracker(people, None)._has_room(new, 1).all()
 
 
+def test_a_gap_of_who_enters_late_has_the_numbers_of_the_recording():
+    rig, _, pixels = passing(2)
+    still = pixels[5:6, :, :1].expand(50, -1, -1, -1, -1).clone()
+    still[:10] = still[14:44] = math.nan
+    (found,) = tracker(rig)(keypoints=still, persons="all")
+    assert (found.first_frame, len(found)) == (10, 40)
+    assert any("in frames 14 to 43;" in note for note in found.notes)
+
+
 def test_a_detection_of_nobody_and_a_double_make_no_person():
     rig, _, pixels = passing(3)
     false = torch.full_like(pixels[:, :, :1], math.nan)
