@@ -313,6 +313,10 @@ class BodyTracker(nn.Module):
                 )
             if keypoints is None:
                 raise InputError(f"method {self.method} takes keypoints, got none")
+            _refuse_given(
+                self.method, initial_state=initial_state, generator=generator, lengths=lengths,
+                facing=facing, n_frames=n_frames,
+            )  # fmt: skip
             if persons is not None and refine != "none":
                 raise InputError(
                     f"refine={refine!r} is for recordings of one person, and persons is given; refine "
@@ -365,7 +369,8 @@ class BodyTracker(nn.Module):
     ) -> BodyStream:
         """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
 
-        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument.
+        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument;
+        keypoints may be given.
 
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
@@ -378,10 +383,14 @@ class BodyTracker(nn.Module):
             `BodyStream` before the first frame.
 
         Raises:
-            InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
-            CameraError: as `forward`.
+            InputError: neither silhouettes nor a pose, nobody seen in the first frame, what "kalman" does not
+            use. ShapeError, CameraError: as `forward`.
         """
         if self.by_keypoints is not None:
+            _refuse_given(
+                self.method, silhouettes=silhouettes, initial_state=initial_state,
+                generator=generator, facing=facing,
+            )  # fmt: skip
             return BodyStream(None, 0, None)
         if initial_state is None:
             if silhouettes is None and keypoints is None:
@@ -553,6 +562,11 @@ def _refuse(unused: Sequence[str], where: str) -> None:
     """Raise `InputError` for arguments that the method does not use."""
     if unused:
         raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
+
+
+def _refuse_given(method: str, **arguments: Any) -> None:
+    """Raise `InputError` for arguments that were given to a method that does not use them."""
+    _refuse([name for name, v in arguments.items() if v is not None], f"for method {method}")
 
 
 def _person(body: Body | str | Path | None, height: float) -> Body:

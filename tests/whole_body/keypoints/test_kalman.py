@@ -459,3 +459,43 @@ def test_other_methods_take_no_options_of_this_one(four):
 def test_the_tracker_is_at_the_top():
     assert torchpose.BodyTracker is BodyTracker
     assert math.isclose(tracker(ring(2)).fps, FPS)
+
+
+@pytest.mark.parametrize("nothing", [math.nan, 0.0])
+def test_the_covariance_of_a_missing_keypoint_does_not_matter(nothing):
+    given = scene(2, 4)
+    given.keypoints[:, 0, 7] = math.nan
+    covariance = torch.full_like(given.confidence, 9.0)
+    usual = tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+    covariance[:, 0, 7] = nothing
+    found = tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+    torch.testing.assert_close(found.joints3d, usual.joints3d, rtol=0, atol=0)
+    covariance[:, 0, 6] = nothing
+    with pytest.raises(InputError, match="covariance"):
+        tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+
+
+def test_arguments_of_other_methods_are_refused():
+    given = scene(2, 2)
+    kalman = tracker(given.rig)
+    unused = {
+        "generator": torch.Generator(), "initial_state": torch.zeros(36),
+        "facing": torch.tensor([1.0, 0.0, 0.0]),
+    }  # fmt: skip
+    for name, value in {**unused, "lengths": torch.tensor([1]), "n_frames": 2}.items():
+        with pytest.raises(
+            InputError, match=f"{name} does nothing for method kalman; leave it out"
+        ):
+            kalman(keypoints=given.keypoints, **{name: value})
+    for name, value in unused.items():
+        with pytest.raises(InputError, match=name):
+            kalman.init(**{name: value})
+
+
+def test_a_keypoint_that_is_of_no_ray_is_missing():
+    camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=(-0.35,))
+    keypoints = torch.full((1, 1, 15, 2), 600.0).double()
+    keypoints[0, 0, 3] = torch.tensor([1900.0, 1000.0])
+    frame = tracker(camera).by_keypoints.frames(keypoints, None, None, None)
+    assert (frame.inlier[0, 0] > 0).tolist() == [j != 3 for j in range(15)]
+    assert bool(frame.pixels.isfinite().all())

@@ -223,22 +223,24 @@ class KeypointBodyTracker(nn.Module):
         if not bool((trust.nan_to_num(0) >= 0).all()):
             raise InputError(f"confidence must not be negative, got {float(trust.min()):g}")
         trust = trust.nan_to_num(0.0).clamp_max(1.0)
+        there = torch.isfinite(points).all(-1) & (trust > 0)
         own = self.pixel_std**2 * torch.ones_like(trust)
         relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
         if covariance is not None:
             own, relative = covariance.to(points), torch.zeros_like(trust)
-            if not bool((own[trust > 0] > 0).all()):
-                raise InputError("covariance must be positive, pixels squared")
-        there = torch.isfinite(points).all(-1) & (trust > 0)
+            if not bool((own[there] > 0).all()):
+                raise InputError("covariance of keypoints must be positive, pixels squared")
         inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
         table = body_joints(table.masked_fill(~there[..., None], torch.nan), names)
         pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
         self._check_inside(pixels)
-        pixels = self.rig.undistort_points(pixels).nan_to_num()
+        pixels = self.rig.undistort_points(pixels)
+        known = pixels.isfinite().all(-1)  # some pixels are of no ray through the lens
         own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
-        inlier = torch.where(table[..., 4].isfinite(), inlier, 0.0)
-        return KeypointFrame(pixels, own, relative, inlier)
+        return KeypointFrame(
+            pixels.nan_to_num(), own, relative, torch.where(known, inlier, 0.0)
+        )  # fmt: skip
 
     def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
         """Refuse keypoints most of which lie far outside an image: they are of another size."""
