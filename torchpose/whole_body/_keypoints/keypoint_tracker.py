@@ -112,7 +112,7 @@ class KeypointTracker(nn.Module):
     ) -> None:
         super().__init__()
         self.lasting_std, self.lone = lasting_std, lone
-        self._rig, self._upright = (rig,), upright  # a tuple, so that its tensors are held once
+        self._rig = (rig,)  # a tuple, so that its tensors are held once
         self._lone_trackers: dict[int, KeypointTracker] = {}
         self.lifter: PoseLifter | None = None
         if len(rig) == 1:
@@ -227,10 +227,10 @@ class KeypointTracker(nn.Module):
     ) -> KeypointStep:
         """Return the next frame with those whom one camera sees followed by that camera."""
         stream, pose, _ = step
+        if not bool((pose.started | (stream.alone >= 0)).any()):
+            return step
         there = frame.inlier > 0
-        fresh = pose.started
-        if bool(fresh.any()):
-            fresh = fresh & ~self._triangulated(frame).any(-1) & _sees_enough(there).any(-1)
+        fresh = pose.started & ~self._triangulated(frame).any(-1) & _sees_enough(there).any(-1)
         alone = torch.where(fresh, there.sum(-1).argmax(-1), stream.alone)
         for camera in alone[alone >= 0].unique().tolist():
             for begins in (True, False):
@@ -280,12 +280,13 @@ class KeypointTracker(nn.Module):
 
     def _lone_tracker(self, camera: int, frame: KeypointFrame) -> "KeypointTracker":
         """Return what tracks by one of the cameras alone; it is set up when it is needed first."""
+        device = frame.pixels.device
         if camera not in self._lone_trackers:
             self._lone_trackers[camera] = KeypointTracker(
-                self._rig[0].select([camera]), self.filter.fps, of_one_camera(self.filter.motion),
-                self.filter.n_iterations, self._upright,
+                self._rig[0].select([camera]).to(device), self.filter.fps,
+                of_one_camera(self.filter.motion), self.filter.n_iterations, self.filter.upright,
             )  # fmt: skip
-        return self._lone_trackers[camera].to(frame.pixels.device)
+        return self._lone_trackers[camera].to(device)
 
     def _seen_again(self, stream: KeypointStream, frame: KeypointFrame) -> Bool[Tensor, " B"]:
         """Return on whose bodies cameras agree that one camera had to guess."""
