@@ -114,8 +114,8 @@ def test_upper_bodies(keypoints, confidence, method, device):
     close(found["covariance3d"], here.covariance3d, rtol=1e-3, atol=METRE**2)
 
 
-def body_tracker(seen, device):
-    return moved(torchpose.BodyTracker(seen.rig, "kalman", fps=FPS, up="y"), device)
+def body_tracker(seen, device, fps=FPS):
+    return moved(torchpose.BodyTracker(seen.rig, "kalman", fps=fps, up="y"), device)
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -136,6 +136,19 @@ def test_whole_bodies(cameras, device):
     torch.testing.assert_close(cov, here.covariance3d, rtol=1e-3, atol=METRE**2)
     torch.testing.assert_close(last, here.joints3d[-1], rtol=0, atol=METRE)
     assert there.details.keys() == here.details.keys()
+
+
+@pytest.mark.parametrize("device", [pytest.param("cuda", marks=NEEDS_CUDA)])
+def test_a_whole_body_that_one_of_several_cameras_sees(device):
+    seen = scene(2, 4, noise=2.0)
+    seen.keypoints[:3, 1] = torch.nan
+    here = body_tracker(seen, "cpu", 3.0)(keypoints=seen.keypoints)
+    with use_of(device):
+        there = body_tracker(seen, device, 3.0)(keypoints=seen.keypoints)
+        joints, cov = there.joints3d.cpu(), there.covariance3d.cpu()
+    assert here.first_frame == there.first_frame == 2 and bool(here.respread[-1])
+    torch.testing.assert_close(joints, here.joints3d, rtol=0, atol=METRE)
+    torch.testing.assert_close(cov, here.covariance3d, rtol=1e-3, atol=METRE**2)
 
 
 def test_cameras_that_are_slightly_wrong(device):

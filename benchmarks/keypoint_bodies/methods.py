@@ -12,7 +12,7 @@ from torch import Tensor
 import torchpose
 from benchmarks.keypoint_bodies import peers
 from benchmarks.keypoint_bodies.lifters import load_lifters
-from benchmarks.keypoint_bodies.scoring import Estimate
+from benchmarks.keypoint_bodies.scoring import Estimate, from_the_start
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 
@@ -38,7 +38,8 @@ def track(
     poses = tracker(
         keypoints=keypoints, confidence=confidence, names=BODY_15.names, smoothing=smoothing
     )
-    return Estimate(poses.joints3d, poses.covariance3d)
+    values = (poses.joints3d, poses.covariance3d)
+    return Estimate(*(from_the_start(value, poses.first_frame) for value in values))
 
 
 METHODS: dict[str, Method] = {

@@ -28,6 +28,11 @@ class Estimate(NamedTuple):
     covariance: Tensor | None = None
 
 
+def from_the_start(values: Tensor, first_frame: int) -> Tensor:
+    """Return values of all frames, the first one also in those before it."""
+    return torch.cat([values[:1].expand(first_frame, *values.shape[1:]), values])
+
+
 class Score(NamedTuple):
     """Measures of a clip.
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.keypoint_bodies.real import Filmed, read_filmed
+from benchmarks.keypoint_bodies.scoring import from_the_start
 from benchmarks.keypoint_cameras.disturbed import with_poses
 from benchmarks.keypoint_cameras.ways import track
 from torchpose.camera import CameraRig
@@ -85,7 +86,8 @@ def _left_out(rig: CameraRig, filmed: Filmed) -> Float[Tensor, " N"]:
         found = track(
             rig.select(rows), filmed.keypoints[:, rows], filmed.confidence[:, rows], filmed.fps
         )
-        off = (rig(found.joints3d).pixels[:, c] - filmed.keypoints[:, c]).norm(dim=-1)
+        joints = from_the_start(found.joints3d, found.first_frame)
+        off = (rig(joints).pixels[:, c] - filmed.keypoints[:, c]).norm(dim=-1)
         errors.append(off[filmed.confidence[:, c] > _SURE])
     return torch.cat(errors)
 

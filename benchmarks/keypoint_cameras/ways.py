@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import torchpose
+from benchmarks.keypoint_bodies.scoring import from_the_start
 from benchmarks.keypoint_cameras.disturbed import Disturbed, in_step, with_poses
 from benchmarks.keypoint_cameras.peers import bundle_adjusted, correlated_delays
 from torchpose.body import BODY_15
@@ -63,7 +64,8 @@ def refined(clip: Disturbed, what: str) -> Found:
     poses = track(clip.said, clip.keypoints, clip.confidence, clip.fps, refine=what)
     rotation = rotvec_to_matrix(poses.details["camera_rotation"][0])
     rig = with_poses(clip.said, rotation, poses.details["camera_translation"][0])
-    return Found(poses.joints3d, poses.details["camera_delays"][0], rig)
+    joints = from_the_start(poses.joints3d, poses.first_frame)
+    return Found(joints, poses.details["camera_delays"][0], rig)
 
 
 def peers(clip: Disturbed, what: str) -> Found:
@@ -104,4 +106,5 @@ def measure(found: Found, clip: Disturbed) -> Errors:
 
 def _tracked(clip: Disturbed, delays: Tensor, rig: CameraRig) -> Found:
     moved = in_step(clip.keypoints, delays), in_step(clip.confidence, delays)
-    return Found(track(rig, *moved, clip.fps).joints3d, delays, rig)
+    poses = track(rig, *moved, clip.fps)
+    return Found(from_the_start(poses.joints3d, poses.first_frame), delays, rig)

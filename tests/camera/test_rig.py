@@ -1,5 +1,7 @@
 """Camera rigs: the cameras one by one, sizes, and OpenCV's projection with distortion."""
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -109,6 +111,36 @@ def test_undistort_moves_spots_to_where_forward_puts_them(fisheye, dtype):
         assert moved > 0.3  # without it the spots would be elsewhere
     tensor = rig.undistort(torch.from_numpy(images))
     assert isinstance(tensor, torch.Tensor) and np.array_equal(tensor.numpy(), straight)
+
+
+@pytest.mark.parametrize(
+    "distortions, fisheye",
+    [((-0.27, 0.09, 0, 0, -0.015), False), ((-0.35,), False), ((0.2, -0.05), True)],
+)
+def test_undistort_points_is_the_inverse_of_opencv_out_to_the_corners(distortions, fisheye):
+    camera = PinholeCamera(
+        900, 900, 959.5, 539.5, 1920, 1080, distortions=distortions, fisheye=fisheye
+    )
+    sides = torch.linspace(-0.6, 0.6, 7).double(), torch.linspace(-0.4, 0.4, 5).double()
+    rays = torch.cartesian_prod(*sides)
+    points = torch.cat([rays, torch.ones_like(rays[:, :1])], -1).numpy()[:, None]
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    d = np.zeros(4)
+    d[: len(distortions)] = distortions[:4]
+    d = d if fisheye else np.append(d, distortions[4:] or 0.0)
+    seen = project(points, np.zeros(3), np.zeros(3), camera.matrix.numpy(), d)[0]
+    pixels = torch.from_numpy(seen).reshape(1, -1, 2)
+    wanted = 900 * rays + torch.tensor([959.5, 539.5])
+    found = CameraRig([camera]).undistort_points(pixels)[0]
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
+
+
+def test_undistort_points_has_nothing_where_no_ray_ends():
+    camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=(-0.35,))
+    pixels = torch.tensor([[[959.5, 539.5], [1900.0, 1000.0], [math.nan, 0.0]]]).double()
+    found = CameraRig([camera]).undistort_points(pixels)[0]
+    torch.testing.assert_close(found[0], pixels[0, 0])
+    assert found[1].isnan().all() and found[2, 0].isnan()
 
 
 def test_undistort_colour_and_nothing_to_do():

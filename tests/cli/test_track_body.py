@@ -9,7 +9,7 @@ import torch
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli import main
-from torchpose.cli._track_body_output import action_text
+from torchpose.cli._track_body_output import action_text, draw, project_joints
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.priors import ActionBank, ManifoldInfo
@@ -362,3 +362,46 @@ def test_files_of_something_else_are_refused(recorded, tmp_path, capsys):
     assert "expected limb conditionals of the parts pelvis" in capsys.readouterr().err
     assert main(arguments(folder, tmp_path, "--action", str(tmp_path / "limbs.safetensors"))) == 2
     assert "torchpose-action-space" in capsys.readouterr().err
+
+
+# --- what is drawn ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_joints_are_drawn_where_the_lens_puts_them(fisheye):
+    values = (0.1, -0.03, 0.01, 0.002) if fisheye else (-0.2, 0.05, 0.003, -0.002, 0.01, 0.02)
+    points = torch.tensor([[0.3, -0.2, 1.0], [-0.4, 0.1, 2.0], [0.0, 0.2, -1.0]]).double()
+    for length in range(len(values) + 1):
+        camera = PinholeCamera(
+            500, 510, 320, 240, 640, 480, skew=3.0, rotation=(0.1, 0.2, 0.3),
+            translation=(0.1, 0.0, 0.5), distortions=values[:length], fisheye=fisheye,
+        )  # fmt: skip
+        found, straight = project_joints(points, camera), camera(points)[:2, :2]
+        assert found[2].isnan().all()  # behind the camera
+        again = CameraRig([camera]).undistort_points(found[None])[0]
+        torch.testing.assert_close(again[:2], straight, rtol=0, atol=1e-4)
+        moved = (found[:2] - straight).norm(dim=-1)
+        assert bool(moved.max() > 1) == (length > 0)
+
+
+def test_videos_are_not_read_past_the_last_pose(tmp_path):
+    class Films:
+        names, sizes, fps, read = ["a"], [(16, 16)], 30.0, 0
+
+        def images(self):
+            for _ in range(10):
+                self.read += 1
+                yield (np.zeros((16, 16, 3), np.uint8),)
+
+        def drawn(self, people, t, images):
+            return list(images)
+
+    class Poses:
+        first_frame = 2
+
+        def __len__(self):
+            return 3
+
+    films = Films()
+    assert draw(films, [Poses()], tmp_path, videos=False, picture=True)
+    assert films.read == 6

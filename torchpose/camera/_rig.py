@@ -14,9 +14,20 @@ from torchpose._core.checks import check_floating, check_shape
 from torchpose.camera._pinhole import PinholeCamera, load_cameras
 from torchpose.errors import CameraError, InputError
 
-__all__ = ["CameraRig", "Cameras", "RigView", "as_rig", "scale_matrix", "undistortion_maps"]
+__all__ = [
+    "CameraRig",
+    "Cameras",
+    "RigView",
+    "as_rig",
+    "distort_rays",
+    "scale_matrix",
+    "straighten_rays",
+    "undistortion_maps",
+]
 
 _OPENCV_DISTORTIONS = 14  # the longest list that OpenCV takes; zeros change nothing
+_UNTIL = (3, 100, 1e-12)  # steps at most, or this change, of OpenCV's search for an inverse
+_LARGEST_OFF = 1.0  # pixels, between a point and its inverse distorted again
 
 
 class RigView(NamedTuple):
@@ -209,7 +220,8 @@ class CameraRig(nn.Module):
             points: [..., C, N, 2], pixels of the C cameras; NaN stays NaN.
 
         Returns:
-            [..., C, N, 2], pixels; the same tensor where no camera is distorted.
+            [..., C, N, 2], pixels; the same tensor where no camera is distorted. NaN where the distortions
+            have no inverse: no ray in front of the camera ends there.
 
         Raises:
             CameraError: another number of cameras. ShapeError: no such points.
@@ -261,23 +273,19 @@ class CameraRig(nn.Module):
 
     def _straightened(self, camera: int, points: Tensor) -> Tensor:
         """Return the undistorted pixels [..., N, 2] of one camera."""
-        import cv2
-
         d, K = self.distortions[camera].double().cpu(), self.matrix[camera].double().cpu()
         known = torch.isfinite(points).all(-1)
         if not bool(d.any()) or not bool(known.any()):
             return points
         pixels = points[known].double().cpu()
         rays = torch.linalg.solve(K, torch.cat([pixels, torch.ones_like(pixels[:, :1])], -1).mT).mT
-        source = np.ascontiguousarray(rays[:, :2].numpy())[:, None]
-        eye = np.eye(3)
-        if self.fisheye[camera]:
-            found = cv2.fisheye.undistortPoints(source, eye, d[:4].numpy())
-        else:
-            found = cv2.undistortPoints(source, eye, d.numpy())
-        rays[:, :2] = torch.from_numpy(np.asarray(found)[:, 0])
+        straight_rays = straighten_rays(rays[:, :2], d, self.fisheye[camera])
+        again = distort_rays(straight_rays, d, self.fisheye[camera])
+        off = ((again - rays[:, :2]) @ K[:2, :2].mT).norm(dim=-1)
+        straight_pixels = straight_rays @ K[:2, :2].mT + K[:2, 2]
+        straight_pixels[~(off < _LARGEST_OFF)] = torch.nan
         straight = points.clone()
-        straight[known] = (rays @ K.mT)[:, :2].to(points)
+        straight[known] = straight_pixels.to(points)
         return straight
 
     def _undistorted(self, camera: int, images: np.ndarray) -> np.ndarray:
@@ -295,6 +303,58 @@ class CameraRig(nn.Module):
         for image, straight in zip(source, out, strict=True):
             straight[:] = cv2.remap(np.ascontiguousarray(image), *maps, cv2.INTER_LINEAR)
         return out > 127 if mask else out
+
+
+def distort_rays(
+    rays: Float[Tensor, "N 2"], distortions: Float[Tensor, " n"], fisheye: bool
+) -> Float[Tensor, "N 2"]:
+    """Return where a lens puts rays (x / z, y / z) in the image plane at z = 1.
+
+    Args:
+        rays: in front of the camera. distortions: up to 14 of OpenCV's, or 4 of its fisheye model.
+        fisheye: whether they are those. Without any that is not 0 the lens changes nothing.
+    """
+    import cv2
+
+    if not len(rays) or not bool(distortions.any()):
+        return rays
+    there = torch.cat([rays, torch.ones_like(rays[:, :1])], -1)
+    source = np.ascontiguousarray(there.double().numpy(force=True))[:, None]
+    model = cv2.fisheye if fisheye else cv2
+    d, zero = _in_full(distortions, fisheye), np.zeros(3)
+    found = model.projectPoints(source, zero, zero, np.eye(3), d)[0]
+    return torch.from_numpy(np.asarray(found).reshape(-1, 2)).to(rays)
+
+
+def straighten_rays(
+    rays: Float[Tensor, "N 2"], distortions: Float[Tensor, " n"], fisheye: bool
+) -> Float[Tensor, "N 2"]:
+    """Return the rays that a lens puts somewhere in the image plane at z = 1: the inverse of `distort_rays`.
+
+    It is found by iteration, and anything where there is none.
+
+    Args:
+        rays: as the lens puts them. distortions, fisheye: as of `distort_rays`.
+    """
+    import cv2
+
+    if not len(rays) or not bool(distortions.any()):
+        return rays
+    source = np.ascontiguousarray(rays.double().numpy(force=True))[:, None]
+    d, eye = _in_full(distortions, fisheye), np.eye(3)
+    if fisheye:
+        found = cv2.fisheye.undistortPoints(source, eye, d, criteria=_UNTIL)
+    else:
+        found = cv2.undistortPointsIter(source, eye, d, eye, eye, _UNTIL)
+    return torch.from_numpy(np.asarray(found)[:, 0]).to(rays)
+
+
+def _in_full(distortions: Float[Tensor, " n"], fisheye: bool) -> np.ndarray:
+    """Return distortions in a length that OpenCV takes: zeros change nothing."""
+    length = 4 if fisheye else _OPENCV_DISTORTIONS
+    full = np.zeros(length)
+    full[: len(distortions)] = distortions.double().numpy(force=True)[:length]
+    return full
 
 
 def scale_matrix(

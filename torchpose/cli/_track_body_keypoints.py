@@ -283,7 +283,7 @@ def _detected(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> str:
 
 def _agreement(keypoints: BodyKeypoints, poses: "BodyTrack") -> str:
     """Return the share of every camera's keypoints that are those of the body."""
-    there = keypoints.confidence > 0
+    there = keypoints.confidence[poses.first_frame :][: len(poses)] > 0
     shares = []
     for c, camera in enumerate(keypoints.cameras):
         inlier = poses.details["inlier"][:, c][there[:, c]]

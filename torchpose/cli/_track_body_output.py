@@ -174,7 +174,9 @@ def draw(
             for file, size in zip(files, films.sizes, strict=False)
         ]
         for t, images in enumerate(films.images()):
-            if not first <= t < end:
+            if t >= end:
+                break
+            if t < first:
                 continue
             if not videos and t not in chosen:
                 continue
@@ -189,19 +191,18 @@ def draw(
 
 
 def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
-    """Return the pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied."""
-    import cv2
-    import numpy as np
+    """Return the pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied.
+
+    Points behind the camera have none: NaN.
+    """
     import torch
 
-    model = cv2.fisheye if camera.fisheye else cv2
-    distortions = camera.distortions.numpy()
-    pixels, _ = model.projectPoints(
-        np.ascontiguousarray(joints.detach().cpu().double().numpy())[:, None],
-        camera.rotation.numpy(), camera.translation.numpy(), camera.matrix.numpy(),
-        distortions if len(distortions) else np.zeros(4),
-    )  # fmt: skip
-    return torch.from_numpy(np.asarray(pixels).reshape(-1, 2))
+    from torchpose.camera._rig import distort_rays
+
+    points = joints.detach().cpu().double() @ camera.rotation_matrix.mT + camera.translation
+    rays = distort_rays(points[:, :2] / points[:, 2:], camera.distortions, camera.fisheye)
+    pixels = rays @ camera.matrix[:2, :2].mT + camera.matrix[:2, 2]
+    return torch.where(points[:, 2:] > 0, pixels, torch.nan)
 
 
 def _write_strip(path: Path, strip: list[list[Any]]) -> Path:

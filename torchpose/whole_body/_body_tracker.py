@@ -41,6 +41,7 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KEYPOINT_METHOD,
     KeypointBodyTracker,
 )
+from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 from torchpose.whole_body._keypoints.people_body_tracker import PeopleBodyTracker
 from torchpose.whole_body._keypoints.people_tracker import PeopleStream
@@ -299,8 +300,8 @@ class BodyTracker(nn.Module):
             they were found.
 
         Raises:
-            NobodySeenError: by all cameras in any frame, or no keypoint. InputError: silhouettes that are not
-            bool, or lengths outside 1..T.
+            NobodySeenError: by all cameras in any frame, or too few keypoints. InputError: silhouettes that
+            are not bool, or lengths outside 1..T.
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
@@ -312,6 +313,10 @@ class BodyTracker(nn.Module):
                 )
             if keypoints is None:
                 raise InputError(f"method {self.method} takes keypoints, got none")
+            _refuse_given(
+                self.method, initial_state=initial_state, generator=generator, lengths=lengths,
+                facing=facing, n_frames=n_frames,
+            )  # fmt: skip
             if persons is not None and refine != "none":
                 raise InputError(
                     f"refine={refine!r} is for recordings of one person, and persons is given; refine "
@@ -344,13 +349,8 @@ class BodyTracker(nn.Module):
             there, later = begun + len(poses), sum(1 for _ in source)
             check_lengths(lengths, 1, there + later, lengths.device)
             poses = repeat_last(poses, later)
-        if begun:
-            unseen = (
-                "not all cameras saw somebody"
-                if measured is None
-                else "too few keypoints were given"
-            )
-            poses.notes += (f"the first {begun} frames, in which {unseen}, have no pose",)
+        unseen = "not all cameras saw somebody" if measured is None else TOO_FEW
+        poses.notes += late_note(begun, unseen)
         return poses
 
     @takes_former_arguments
@@ -369,7 +369,8 @@ class BodyTracker(nn.Module):
     ) -> BodyStream:
         """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
 
-        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument.
+        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument;
+        keypoints may be given.
 
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
@@ -382,10 +383,14 @@ class BodyTracker(nn.Module):
             `BodyStream` before the first frame.
 
         Raises:
-            InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
-            CameraError: as `forward`.
+            InputError: neither silhouettes nor a pose, nobody seen in the first frame, what "kalman" does not
+            use. ShapeError, CameraError: as `forward`.
         """
         if self.by_keypoints is not None:
+            _refuse_given(
+                self.method, silhouettes=silhouettes, initial_state=initial_state,
+                generator=generator, facing=facing,
+            )  # fmt: skip
             return BodyStream(None, 0, None)
         if initial_state is None:
             if silhouettes is None and keypoints is None:
@@ -450,8 +455,9 @@ class BodyTracker(nn.Module):
             keypoints, confidence, names, covariance, persons: of one frame, as in `forward`.
 
         Returns:
-            The next state, and the `BodyTrack` of this one frame. With `persons` a list of those who are
-            confirmed: a person is from the third frame on, and not earlier than a tenth of a second.
+            The next state, and the `BodyTrack` of this one frame. Until "kalman" has found the person, its
+            poses are NaN and `coasting` is True. With `persons` a list of those who are confirmed: a person
+            is from the third frame on, and not earlier than a tenth of a second.
 
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
@@ -556,6 +562,11 @@ def _refuse(unused: Sequence[str], where: str) -> None:
     """Raise `InputError` for arguments that the method does not use."""
     if unused:
         raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
+
+
+def _refuse_given(method: str, **arguments: Any) -> None:
+    """Raise `InputError` for arguments that were given to a method that does not use them."""
+    _refuse([name for name, v in arguments.items() if v is not None], f"for method {method}")
 
 
 def _person(body: Body | str | Path | None, height: float) -> Body:

@@ -1,5 +1,6 @@
 """Give keypoints to the particle filters over bodies: frames of measurements, and the first pose."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -86,24 +87,30 @@ class BodyKeypointMeasurer:
         return KeypointMeasurement(frames.map(lambda v: v[t : t + 1]), self.maps)
 
     def first_frame(self, frames: KeypointFrame) -> int:
-        """Return the first frame with enough joints for a first pose.
+        """Return the first frame with enough joints for a first pose: the one in which "kalman" begins.
 
         Raises:
             NobodySeenError: there is none.
         """
-        enough = (frames.inlier > 0).any(1).sum(-1) >= LEAST_JOINTS
-        if not bool(enough.any()):
-            raise NobodySeenError(
-                f"no frame has keypoints of {LEAST_JOINTS} joints or more; check the keypoints and "
-                "their names"
-            )
-        return int(enough.int().argmax())
+        return self.tracker.first_frames(frames.map(lambda value: value[None]))[0]
 
     def first_pose(self, frames: KeypointFrame) -> Float[Tensor, " D"]:
-        """Return the pose of the first of some frames, as the Kalman smoother finds it in all of them."""
+        """Return the pose of the first of some frames, as the Kalman smoother finds it in all of them.
+
+        It is that of the first frame with enough joints in any camera.
+
+        Raises:
+            NobodySeenError: there is none.
+        """
         batch = frames.map(lambda value: value[None])
-        joints = self.tracker.tracker(batch, smoothing=True).joints[0, :1]
-        return fit_state(self.body, joints)[0]
+        poses = self.tracker.tracker(batch, smoothing=True, waited=math.inf)
+        if not bool(poses.started.any()):
+            raise NobodySeenError(
+                f"no frame has keypoints of {LEAST_JOINTS} joints or more in any camera; check the "
+                "keypoints and their names"
+            )
+        begun = int(poses.started[0].int().argmax())
+        return fit_state(self.body, poses.joints[0, begun : begun + 1])[0]
 
 
 def observed_frames(

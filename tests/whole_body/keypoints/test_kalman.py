@@ -20,6 +20,7 @@ from torchpose.errors import (
 )
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body import BodyTrack, BodyTracker
+from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 
 J = BODY_15.joint
 
@@ -178,24 +179,110 @@ def test_a_person_who_went_away_is_found_elsewhere(four):
     assert float(errors(found, joints)[-1].mean()) < 0.03
 
 
-def test_who_comes_late_has_no_earlier_pose(four):
-    keypoints = four.keypoints.clone()
-    keypoints[:5] = torch.nan
-    found = track(four._replace(keypoints=keypoints))
-    assert found.coasting[:5].all() and not found.respread.any()
-    assert float(errors(found, four.joints)[15:].mean()) < 0.012
+@pytest.mark.parametrize("smoothing", ["none", "full"])
+def test_who_comes_late_has_no_earlier_pose(smoothing):
+    """The pose, body and all are those of the same keypoints without the empty frames before."""
+    small = scene(3, 12, height=0.9)
+    late = torch.cat([torch.full_like(small.keypoints, math.nan), small.keypoints])
+    found, alone = (
+        tracker(small.rig)(keypoints=k, smoothing=smoothing) for k in (late, small.keypoints)
+    )
+    assert found.first_frame == 12 and len(found) == 12
+    assert found.notes == (*alone.notes, late_note(12, TOO_FEW)[0])
+    torch.testing.assert_close(found.joints3d, alone.joints3d, rtol=0, atol=0)
+    torch.testing.assert_close(found.state, alone.state, rtol=0, atol=0)
+    assert found.body.height == pytest.approx(0.9, abs=0.1)
+    together = tracker(small.rig)(keypoints=torch.stack([late, late.flip(0)]), smoothing=smoothing)
+    assert [(one.first_frame, len(one)) for one in together] == [(12, 12), (0, 24)]
+    torch.testing.assert_close(together[0].joints3d, alone.joints3d)
 
 
-def test_a_start_waits_for_a_second_camera_and_not_for_ever(four):
-    """One camera has no distance: a body that it alone begins would stay at a wrong one."""
-    late, never = four.keypoints[:, :2].clone(), four.keypoints[:, :2].clone()
-    late[:5, 1], never[:, 1] = torch.nan, torch.nan
-    two = tracker(four.rig.select([0, 1]))
-    found = two(keypoints=late)
-    assert found.coasting.tolist() == [True] * 5 + [False] * (len(late) - 5)
-    assert float(errors(found, four.joints)[10:].mean()) < 0.025
-    alone = two(keypoints=never).coasting
-    assert bool(alone[:15].all()) and not bool(alone[17:].any())
+def test_a_late_track_is_written_with_its_frames(tmp_path):
+    small = scene(3, 4, height=0.9)
+    late = torch.cat([torch.full_like(small.keypoints, math.nan), small.keypoints])
+    found = tracker(small.rig)(keypoints=late)
+    found.save(tmp_path / "body.npz")
+    assert BodyTrack.load(tmp_path / "body.npz").first_frame == 4
+    found.export(tmp_path / "body.trc")
+    rows = (tmp_path / "body.trc").read_text().splitlines()[6:]
+    assert [row.split("\t")[0] for row in rows if row] == ["5", "6", "7", "8"]
+
+
+def test_cameras_of_a_late_track_are_refined_from_its_beginning():
+    given = scene(2, 30)
+    late = torch.cat([torch.full_like(given.keypoints[:6], math.nan), given.keypoints])
+    found = tracker(given.rig)(keypoints=late, refine="extrinsics")
+    assert (found.first_frame, len(found)) == (6, 30)
+    assert len(found.details["camera_delays"]) == 30
+
+
+def test_live_there_is_no_pose_before_the_first(four):
+    live = tracker(four.rig)
+    nothing = torch.full_like(four.keypoints[0], math.nan)
+    state, before = live.step(live.init(), keypoints=nothing)
+    state, begun = live.step(state, keypoints=four.keypoints[0])
+    for name in ("state", "state_std", "joints3d", "covariance3d"):
+        assert getattr(before, name).isnan().all() and getattr(begun, name).isfinite().all()
+    assert bool(before.coasting) and not bool(begun.coasting)
+    assert [len(before), begun.first_frame] == [1, 1]
+
+
+def test_who_is_never_seen_well_enough_is_nobody():
+    given = scene(2, 10)
+    given.keypoints[:, 0, 5:] = math.nan
+    given.keypoints[:, 1] = math.nan
+    with pytest.raises(NobodySeenError, match="two cameras"):
+        tracker(given.rig)(keypoints=given.keypoints)
+
+
+# --- one of several cameras -------------------------------------------------------------------------
+
+
+def test_a_start_waits_for_a_second_camera(four):
+    late = four.keypoints[:, :2].clone()
+    late[:5, 1] = torch.nan
+    found = tracker(four.rig.select([0, 1]))(keypoints=late)
+    assert found.first_frame == 5 and not found.coasting.any()
+    assert float(errors(found, four.joints[5:])[5:].mean()) < 0.025
+
+
+def test_one_of_several_cameras_tracks_as_if_it_were_the_only_one():
+    given = scene(3, 30, noise=2.0)
+    given.keypoints[:, 1:] = torch.nan
+    found = tracker(given.rig)(keypoints=given.keypoints)
+    assert found.first_frame == 16  # half a second later
+    one = tracker(given.rig.select([0]))(keypoints=given.keypoints[16:, :1])
+    torch.testing.assert_close(found.joints3d, one.joints3d)
+    assert any("one camera alone (c0)" in note for note in found.notes)
+    ray = torch.nn.functional.normalize(found.joints3d[-1, 0] - _centre(given.rig, 0), dim=0)
+    along, usual = (float(ray @ track.covariance3d[-1, 0] @ ray) for track in (found, one))
+    assert along > usual + 0.1**2
+
+
+def test_a_second_camera_begins_anew_what_one_had_to_guess():
+    given = scene(2, 30, noise=2.0, height=1.3)
+    given.keypoints[:20, 1] = torch.nan
+    found = tracker(given.rig)(keypoints=given.keypoints)
+    assert found.first_frame == 16 and found.respread.nonzero().tolist() == [[4]]
+    off = errors(found, given.joints[16:]).mean(-1)
+    assert float(off[:4].min()) > 0.5 and float(off[4:].max()) < 0.05
+
+
+def test_another_camera_goes_on_where_the_only_one_loses_the_person():
+    given = scene(2, 40, noise=2.0)
+    given.keypoints[:20, 1] = torch.nan
+    given.keypoints[20:, 0] = torch.nan
+    found = tracker(given.rig)(keypoints=given.keypoints)
+    assert found.respread.nonzero().tolist() == [[20]]
+    assert found.coasting[4:20].all() and not found.coasting[20:].any()
+    assert float(errors(found, given.joints[16:])[20:].mean()) < 0.4
+
+
+def _centre(rig, camera):
+    return -rig.rotation[camera].T @ rig.translation[camera]
+
+
+# --- cameras that disagree --------------------------------------------------------------------------
 
 
 def test_a_camera_that_sees_something_else_is_named(four):
@@ -372,3 +459,43 @@ def test_other_methods_take_no_options_of_this_one(four):
 def test_the_tracker_is_at_the_top():
     assert torchpose.BodyTracker is BodyTracker
     assert math.isclose(tracker(ring(2)).fps, FPS)
+
+
+@pytest.mark.parametrize("nothing", [math.nan, 0.0])
+def test_the_covariance_of_a_missing_keypoint_does_not_matter(nothing):
+    given = scene(2, 4)
+    given.keypoints[:, 0, 7] = math.nan
+    covariance = torch.full_like(given.confidence, 9.0)
+    usual = tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+    covariance[:, 0, 7] = nothing
+    found = tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+    torch.testing.assert_close(found.joints3d, usual.joints3d, rtol=0, atol=0)
+    covariance[:, 0, 6] = nothing
+    with pytest.raises(InputError, match="covariance"):
+        tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+
+
+def test_arguments_of_other_methods_are_refused():
+    given = scene(2, 2)
+    kalman = tracker(given.rig)
+    unused = {
+        "generator": torch.Generator(), "initial_state": torch.zeros(36),
+        "facing": torch.tensor([1.0, 0.0, 0.0]),
+    }  # fmt: skip
+    for name, value in {**unused, "lengths": torch.tensor([1]), "n_frames": 2}.items():
+        with pytest.raises(
+            InputError, match=f"{name} does nothing for method kalman; leave it out"
+        ):
+            kalman(keypoints=given.keypoints, **{name: value})
+    for name, value in unused.items():
+        with pytest.raises(InputError, match=name):
+            kalman.init(**{name: value})
+
+
+def test_a_keypoint_that_is_of_no_ray_is_missing():
+    camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=(-0.35,))
+    keypoints = torch.full((1, 1, 15, 2), 600.0).double()
+    keypoints[0, 0, 3] = torch.tensor([1900.0, 1000.0])
+    frame = tracker(camera).by_keypoints.frames(keypoints, None, None, None)
+    assert (frame.inlier[0, 0] > 0).tolist() == [j != 3 for j in range(15)]
+    assert bool(frame.pixels.isfinite().all())

@@ -199,6 +199,27 @@ def test_frames_without_keypoints_coast():
     assert poses.coasting.tolist() == [False, False, True, False]
 
 
+def test_the_first_pose_is_that_of_the_frame_in_which_two_cameras_see_the_person():
+    seen = scene(cameras=3, n_frames=12, noise=2.0)
+    seen.keypoints[:3, 1:] = math.nan
+    tracker = BodyTracker(seen.rig, "sir", height=1.7, n_particles=100, fps=30.0)
+    found = tracker(keypoints=seen.keypoints, generator=torch.Generator().manual_seed(0))
+    assert found.first_frame == 3 and any("first 3 frames" in note for note in found.notes)
+    assert float(errors(found, seen.joints[3:])[0].mean()) < 0.07
+
+
+def test_a_live_stream_begins_with_the_pose_that_one_camera_tells():
+    seen = scene(cameras=3, n_frames=6, noise=2.0)
+    seen.keypoints[:, 1:] = math.nan
+    tracker = BodyTracker(seen.rig, "sir", height=1.7, n_particles=100, fps=30.0)
+    state = tracker.init(keypoints=seen.keypoints, generator=torch.Generator().manual_seed(0))
+    joints = tracker.body.joints(state.filter.particles[0].mean(0))
+    assert float((joints - seen.joints[0]).norm(dim=-1).mean()) < 0.4
+    seen.keypoints[:, :, 5:] = math.nan
+    with pytest.raises(NobodySeenError, match="in any camera"):
+        tracker.init(keypoints=seen.keypoints)
+
+
 def test_bad_keypoints_are_refused():
     seen = scene(cameras=2, n_frames=2)
     tracker = BodyTracker(seen.rig, "sir", height=1.7, n_particles=20)
@@ -208,7 +229,7 @@ def test_bad_keypoints_are_refused():
         tracker(keypoints=seen.keypoints, smoothing="full")
     with pytest.raises(ShapeError, match="keypoints"):
         tracker(keypoints=seen.keypoints[None])
-    with pytest.raises(NobodySeenError, match="joints"):
+    with pytest.raises(NobodySeenError, match="no keypoint"):
         tracker(keypoints=torch.full_like(seen.keypoints, torch.nan))
     with pytest.raises(InputError, match="takes keypoints and no silhouettes"):
         BodyTracker(seen.rig, "kalman")(

@@ -9,6 +9,7 @@ from tests.whole_body.keypoints.scenes import FPS, moving_body, ring
 from torchpose.errors import InputError, NobodySeenError, ShapeError
 from torchpose.whole_body import BodyTracker
 from torchpose.whole_body._keypoints.people_association import assign, detection_gains
+from torchpose.whole_body._keypoints.people_tracker import PeopleTracker
 
 T = 40
 
@@ -87,6 +88,59 @@ def test_who_enters_late_and_leaves_is_tracked_while_there():
     found = tracker(rig)(keypoints=shuffled(pixels)[0], persons="all", smoothing="full")
     assert [(one.first_frame, len(one)) for one in found] == [(0, T), (10, 20)]
     assert (found[1].details["detection"][:, 2] == -1).all()
+
+
+def back_to_back(turn):
+    """Two persons 0.6 m apart, seen from a turned side by three cameras: joints and keypoints."""
+    joints = [moving_body(T) @ about_up(turn), moving_body(T, 1.8, phase=0.4) @ about_up(turn + 3)]
+    joints[1][..., 2] += 0.6
+    rig = ring(3)
+    pixels = torch.stack([rig(one).pixels for one in joints], 2)
+    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).double()
+    return rig, torch.stack(joints, 1), pixels + 2 * noise
+
+
+def about_up(angle):
+    sin, cos = math.sin(angle), math.cos(angle)
+    return torch.tensor([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]]).double()
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.0])
+def test_two_persons_whom_one_camera_each_sees_stay_two(turn):
+    rig, joints, pixels = back_to_back(turn)
+    pixels[12:, 1:, 0] = math.nan
+    pixels[12:, 0, 1] = pixels[12:, 2, 1] = math.nan
+    found = tracker(rig)(keypoints=pixels, persons="all")
+    assert [len(one) for one in found] == [T, T]
+    off = [(one.joints3d - joints.movedim(1, 0)).norm(dim=-1).mean((1, 2)) for one in found]
+    assert {int(each.argmin()) for each in off} == {0, 1}
+    assert max(float(each.min()) for each in off) < 0.1
+
+
+@pytest.mark.parametrize("turn", [0.0, 4.0])
+def test_somebody_whom_another_camera_sees_does_not_move_a_person(turn):
+    rig, joints, pixels = back_to_back(turn)
+    pixels[10:, 1:, 0] = math.nan
+    pixels[:20, :, 1] = pixels[:, 0, 1] = pixels[:, 2, 1] = math.nan
+    (found,) = tracker(rig)(keypoints=pixels, persons="all")
+    assert len(found) == T and not found.respread.any()
+    assert float((found.joints3d - joints[:, 0]).norm(dim=-1).mean()) < 0.1
+
+
+def test_persons_who_are_there_begin_anew_where_there_is_no_room_for_others():
+    people = tracker(ring(2)).by_keypoints.tracker
+    new = torch.tensor([True, False, True, True])
+    assert PeopleTracker(people, 2)._has_room(new, 1).tolist() == [True, True, False, False]
+    assert PeopleTracker(people, None)._has_room(new, 1).all()
+
+
+def test_a_gap_of_who_enters_late_has_the_numbers_of_the_recording():
+    rig, _, pixels = passing(2)
+    still = pixels[5:6, :, :1].expand(50, -1, -1, -1, -1).clone()
+    still[:10] = still[14:44] = math.nan
+    (found,) = tracker(rig)(keypoints=still, persons="all")
+    assert (found.first_frame, len(found)) == (10, 40)
+    assert any("in frames 14 to 43;" in note for note in found.notes)
 
 
 def test_a_detection_of_nobody_and_a_double_make_no_person():

@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_choice, check_positive, check_shape
@@ -27,13 +28,15 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     refine_cameras,
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_notes import notes_of
+from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note, notes_of
 from torchpose.whole_body._keypoints.keypoint_tracker import (
+    LEAST_JOINTS,
     KeypointPoses,
     KeypointStream,
     KeypointTracker,
 )
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
+from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import known_up
 
@@ -81,6 +84,7 @@ class KeypointBodyTracker(nn.Module):
         super().__init__()
         self.rig, self.fps = rig, float(fps)
         alone = len(rig) == 1
+        std_of_one = _KEYPOINT_STD_OF_ONE if keypoint_std is None else keypoint_std
         if keypoint_std is None:
             keypoint_std = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
         self.keypoint_std = check_positive("keypoint_std", keypoint_std)
@@ -101,7 +105,10 @@ class KeypointBodyTracker(nn.Module):
         self.sized = body is not None or height is not None
         lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
         known = None if up is None else known_up(rig, up)
-        self.tracker = KeypointTracker(rig, self.fps, motion, upright=known, lasting_std=lasting)
+        self.tracker = KeypointTracker(
+            rig, self.fps, motion, upright=known, lasting_std=lasting,
+            lone=LoneNoise((std_of_one / self.keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
+        )  # fmt: skip
 
     @torch.no_grad()
     def forward(
@@ -127,11 +134,14 @@ class KeypointBodyTracker(nn.Module):
         single = keypoints.ndim == 4
         if single:
             frames = frames.map(lambda value: value[None])
-        self._check_seen(frames)
+        begun = self.first_frames(frames)
         if refine != "none":
-            return self._refined_track(frames, refine, smoothing == "full", progress)
+            frames = frames.map(lambda value: value[:, begun[0] :])
+            return self._refined_track(frames, refine, smoothing == "full", progress, begun[0])
         poses = self.tracker(frames, smoothing == "full", progress)
         tracks = [self.track(poses, frames, b, cameras=b == 0) for b in range(len(frames.pixels))]
+        for track in tracks:
+            track.notes += late_note(track.first_frame, TOO_FEW)
         return tracks[0] if single else tracks
 
     @torch.no_grad()
@@ -151,7 +161,8 @@ class KeypointBodyTracker(nn.Module):
         stream, pose, _ = self.tracker.advance(stream, frame)
         poses = _with_time(pose)
         frames = frame.map(lambda value: value[:, None])
-        return stream, self.track(poses, frames, 0, summed_up=False)
+        track = self.track(poses, frames, 0, summed_up=False)
+        return stream, track if bool(stream.begun) else _unknown(track)
 
     # --- cameras ----------------------------------------------------------------------------------
 
@@ -171,7 +182,7 @@ class KeypointBodyTracker(nn.Module):
             )
 
     def _refined_track(
-        self, frames: KeypointFrame, refine: str, smoothing: bool, progress: bool
+        self, frames: KeypointFrame, refine: str, smoothing: bool, progress: bool, first_frame: int
     ) -> BodyTrack:
         """Return the track with cameras without the errors that keypoints tell of."""
         former = self.tracker.filter
@@ -185,8 +196,9 @@ class KeypointBodyTracker(nn.Module):
             self.rig, single, track, self.fps, refine, former.exchange, smoothing
         )
         moved = found.frames.map(lambda value: value[None])
-        result = self.track(found.poses, moved, 0, refined=found)
-        notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes)
+        result = self.track(found.poses, moved, 0, refined=found, first_frame=first_frame)
+        late = late_note(result.first_frame, TOO_FEW)
+        notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes, *late)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})
 
@@ -211,22 +223,24 @@ class KeypointBodyTracker(nn.Module):
         if not bool((trust.nan_to_num(0) >= 0).all()):
             raise InputError(f"confidence must not be negative, got {float(trust.min()):g}")
         trust = trust.nan_to_num(0.0).clamp_max(1.0)
+        there = torch.isfinite(points).all(-1) & (trust > 0)
         own = self.pixel_std**2 * torch.ones_like(trust)
         relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
         if covariance is not None:
             own, relative = covariance.to(points), torch.zeros_like(trust)
-            if not bool((own[trust > 0] > 0).all()):
-                raise InputError("covariance must be positive, pixels squared")
-        there = torch.isfinite(points).all(-1) & (trust > 0)
+            if not bool((own[there] > 0).all()):
+                raise InputError("covariance of keypoints must be positive, pixels squared")
         inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
         table = body_joints(table.masked_fill(~there[..., None], torch.nan), names)
         pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
         self._check_inside(pixels)
-        pixels = self.rig.undistort_points(pixels).nan_to_num()
+        pixels = self.rig.undistort_points(pixels)
+        known = pixels.isfinite().all(-1)  # some pixels are of no ray through the lens
         own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
-        inlier = torch.where(table[..., 4].isfinite(), inlier, 0.0)
-        return KeypointFrame(pixels, own, relative, inlier)
+        return KeypointFrame(
+            pixels.nan_to_num(), own, relative, torch.where(known, inlier, 0.0)
+        )  # fmt: skip
 
     def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
         """Refuse keypoints most of which lie far outside an image: they are of another size."""
@@ -244,13 +258,29 @@ class KeypointBodyTracker(nn.Module):
                     "rig.scaled(height, width)"
                 )
 
-    def _check_seen(self, frames: KeypointFrame) -> None:
-        """Refuse sequences without a keypoint."""
+    def first_frames(self, frames: KeypointFrame) -> list[int]:
+        """Return the frames in which sequences begin.
+
+        Args:
+            frames: [B, T, C, J, ...].
+
+        Raises:
+            NobodySeenError: one of them never does.
+        """
         seen = (frames.inlier > 0).flatten(1).any(-1)
         if not bool(seen.all()):
             raise NobodySeenError(
                 f"sequence {int((~seen).nonzero()[0])} has no keypoint in any camera and frame"
             )
+        begun = self.tracker.first_frames(frames).tolist()
+        n_frames = frames.pixels.shape[1]
+        if n_frames in begun:
+            where = "" if len(self.rig) == 1 else " in two cameras, nor in one for half a second"
+            raise NobodySeenError(
+                f"sequence {begun.index(n_frames)} has no frame with keypoints of {LEAST_JOINTS} "
+                f"joints or more{where}; check the keypoints and their names"
+            )
+        return begun
 
     # --- poses ------------------------------------------------------------------------------------
 
@@ -262,31 +292,33 @@ class KeypointBodyTracker(nn.Module):
         summed_up: bool = True,
         cameras: bool = True,
         refined: RefinedCameras | None = None,
+        first_frame: int = 0,
     ) -> BodyTrack:
-        """Return the track of one element of the batch."""
+        """Return the track of one element of the batch, from the frame on in which it begins."""
+        begun = int(poses.started[b].int().argmax())
+        poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
+        first_frame += begun
         body = self.tracker.filter.articulation
-        point = poses.point.map(lambda value: value[b])
-        bones = body.bones(point)
-        lengths = bones.norm(dim=-1)
-        rigid = _rigid_body(bones)
-        state = rigid.state_of(point.position, body.world_rotations(point))
-        frame = frames.map(lambda value: value[b])
+        bones = body.bones(poses.point)
+        rigid = _rigid_body(bones, ~poses.coasting)
+        state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
         return BodyTrack(
             rigid,
             state,
-            self._state_std(poses.state_cov[b]),
-            poses.joints[b],
-            poses.covariance[b],
-            poses.log_evidence[b],
-            torch.full_like(poses.log_evidence[b], torch.nan),
-            poses.coasting[b],
-            poses.started[b] & (poses.started[b].cumsum(0) > 1),
+            self._state_std(poses.state_cov),
+            poses.joints,
+            poses.covariance,
+            poses.log_evidence,
+            torch.full_like(poses.log_evidence, torch.nan),
+            poses.coasting,
+            poses.started & (poses.started.cumsum(0) > 1),
             self.fps,
-            notes=self._notes(poses, frame, b, cameras, refined) if summed_up else (),
+            notes=self._notes(poses, frame, cameras, refined, first_frame) if summed_up else (),
+            first_frame=first_frame,
             details={
-                "inlier": poses.inlier[b],
-                "exchanged": poses.exchanged[b],
-                "bone_lengths": lengths,
+                "inlier": poses.inlier,
+                "exchanged": poses.exchanged,
+                "bone_lengths": bones.norm(dim=-1),
             },
             method=KEYPOINT_METHOD,
         )
@@ -303,30 +335,43 @@ class KeypointBodyTracker(nn.Module):
         self,
         poses: KeypointPoses,
         frame: KeypointFrame,
-        b: int,
         cameras: bool,
         refined: RefinedCameras | None,
+        first_frame: int,
     ) -> tuple[str, ...]:
         notes = notes_of(
-            self.rig.names, frame.inlier > 0, poses.inlier[b], poses.exchanged[b],
-            poses.coasting[b], self.sized,
+            self.rig.names, frame.inlier > 0, poses.inlier, poses.exchanged, poses.coasting,
+            poses.alone, self.sized, first_frame,
         )  # fmt: skip
         if len(self.rig) == 1 or not cameras:
             return notes
         rig = self.rig if refined is None else refined.rig
         exchange = self.tracker.filter.exchange
-        doubts = doubt_cameras(rig, frame, poses.joints[b], self.fps, exchange)
+        doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
         return (*notes, *notes_on_cameras(self.rig.names, doubts))
 
 
-def _rigid_body(bones: Float[Tensor, "T J 3"]) -> Body:
-    """Return the body of a track: the median bone of every joint in the axes of the part that carries it."""
+def _rigid_body(bones: Float[Tensor, "T J 3"], measured: Bool[Tensor, " T"]) -> Body:
+    """Return the body of a track: the median bone of every joint in the axes of the part that carries it.
+
+    Frames without a measurement count where there are no others.
+    """
+    bones = bones[measured] if bool(measured.any()) else bones
     middle = bones.median(0).values
     middle[0] = 0
     lengths = middle.norm(dim=-1)
     height = BODY_15.height(lengths)
     radii = BODY_15.standard_radii(height).to(lengths)
     return Body(BODY_15, lengths, radii, directions=middle)
+
+
+def _unknown(track: BodyTrack) -> BodyTrack:
+    """Return a track without poses: NaN in place of what is not known before the first one."""
+    names = ("state", "state_std", "joints3d", "covariance3d", "log_evidence")
+    values: dict[str, Any] = {
+        name: torch.full_like(getattr(track, name), torch.nan) for name in names
+    }
+    return replace(track, **values)
 
 
 def _with_time(pose: KeypointPoses) -> KeypointPoses:

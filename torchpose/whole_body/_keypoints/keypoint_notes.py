@@ -2,14 +2,28 @@
 
 from collections.abc import Sequence
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["notes_of"]
+__all__ = ["TOO_FEW", "late_note", "notes_of"]
+
+TOO_FEW = "too few keypoints were given"
+"""Why a track begins late."""
 
 _DISAGREES = 0.5  # share of a camera's keypoints that are nobody's, above which it is said
 _MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
 _GAP = 30  # frames without keypoints that are worth a word
+
+
+def late_note(first_frame: int, why: str) -> tuple[str, ...]:
+    """Return a note on the frames before the first pose, if there are any.
+
+    Args:
+        first_frame: number of the first pose's. why: there is none before.
+    """
+    if first_frame == 0:
+        return ()
+    return (f"the first {first_frame} frames, in which {why}, have no pose",)
 
 
 def notes_of(
@@ -18,14 +32,17 @@ def notes_of(
     inlier: Float[Tensor, "T C J"],
     exchanged: Float[Tensor, "T C 2"],
     coasting: Bool[Tensor, " T"],
+    alone: Int[Tensor, " T"],
     sized: bool,
+    first_frame: int = 0,
 ) -> tuple[str, ...]:
     """Return notes on the keypoints of a track.
 
     Args:
         cameras: their names. there: which keypoints there were. inlier: probability that each was a joint's.
         exchanged: probability that sides were exchanged. coasting: frames without a measurement.
-        sized: whether the person's size was given.
+        alone: which of several cameras alone decided, -1 if all did.
+        sized: whether the person's size was given. first_frame: number of the first of the frames.
     """
     notes = []
     for c, name in enumerate(cameras):
@@ -50,8 +67,16 @@ def notes_of(
             "one camera does not tell how large a person is: size and distance are those of the persons "
             "of the prior; give height or body if they are known"
         )
+    guessed = int((alone >= 0).sum())
+    if guessed and not sized:
+        seen_by = ", ".join(cameras[c] for c in alone[alone >= 0].unique().tolist())
+        notes.append(
+            f"one camera alone ({seen_by}) saw the person in {guessed} frames: size and distance there "
+            "are those of the persons of the prior; give height or body if they are known"
+        )
     notes += [
-        f"nothing was measured in frames {first} to {last}; the poses there are predictions"
+        f"nothing was measured in frames {first_frame + first} to {first_frame + last}; the poses "
+        "there are predictions"
         for first, last in _runs(coasting)
         if last - first + 1 >= _GAP
     ]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -17,17 +17,30 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
+from torchpose.whole_body._keypoints.known_person import of_one_camera, std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, contradicts, corrected_by
-from torchpose.whole_body._keypoints.lifting_network import Lifted
+from torchpose.whole_body._keypoints.lifting_network import MEMORY, Lifted
+from torchpose.whole_body._keypoints.lone_camera import (
+    NOBODY,
+    SAME_NOISE,
+    LoneNoise,
+    frame_of,
+    into_all,
+    of_any_size,
+    state_of,
+)
 from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
 __all__ = ["LEAST_JOINTS", "KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
 
 LEAST_JOINTS = 6  # that are measured where tracking begins
-_PATIENCE = 0.5  # seconds that a start waits for a second camera, without which it has no distance
+_PATIENCE = (
+    0.5  # seconds that a start waits for a second camera, without which it guesses the distance
+)
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 
@@ -39,12 +52,14 @@ class KeypointStream(NamedTuple):
         state: Gaussians of [B]. begun: [B], whether the person was found.
         lost: [B], for how many frames in a row most keypoints have been of something else, or the person has
             waited for a start.
-        memory: [B, L, W], of the network that lifts keypoints of one camera; empty with several.
+        alone: [B], which of several cameras alone the person is followed by, -1 if by all.
+        memory: [B, L, W], of the network that lifts keypoints of one camera.
     """
 
     state: BodyGaussian
     begun: Tensor
     lost: Tensor
+    alone: Tensor
     memory: Tensor
 
 
@@ -56,7 +71,7 @@ class KeypointPoses(NamedTuple):
         point: the states, on the manifold. state_cov: [..., N, N], in their tangent spaces.
         inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of
             arms, of legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...],
-            where tracking began.
+            where tracking began. alone: [...], which of several cameras alone decided, -1 if all did.
     """
 
     joints: Tensor
@@ -68,6 +83,10 @@ class KeypointPoses(NamedTuple):
     log_evidence: Tensor
     coasting: Tensor
     started: Tensor
+    alone: Tensor
+
+
+KeypointStep = tuple[KeypointStream, KeypointPoses, CorrectedBody]
 
 
 class KeypointTracker(nn.Module):
@@ -78,6 +97,7 @@ class KeypointTracker(nn.Module):
         upright: how people lean, if it is known which way is up; with one camera, this is taken to be level.
         lasting_std: metres, of what is wrong with joints for so long that frames do not average it out, along
             each axis; covariances of joints have it on top.
+        lone: noise where one of several cameras alone sees a person.
     """
 
     def __init__(
@@ -88,9 +108,12 @@ class KeypointTracker(nn.Module):
         n_iterations: int = 3,
         upright: Upright | None = None,
         lasting_std: float = 0.0,
+        lone: LoneNoise = SAME_NOISE,
     ) -> None:
         super().__init__()
-        self.lasting_std = lasting_std
+        self.lasting_std, self.lone = lasting_std, lone
+        self._rig = (rig,)  # a tuple, so that its tensors are held once
+        self._lone_trackers: dict[int, KeypointTracker] = {}
         self.lifter: PoseLifter | None = None
         if len(rig) == 1:
             upright = camera_up(rig) if upright is None else upright
@@ -98,19 +121,24 @@ class KeypointTracker(nn.Module):
         self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
 
     def forward(
-        self, frames: KeypointFrame, smoothing: bool = False, progress: bool = False
+        self,
+        frames: KeypointFrame,
+        smoothing: bool = False,
+        progress: bool = False,
+        waited: float = 0.0,
     ) -> KeypointPoses:
         """Track whole sequences.
 
         Args:
             frames: [B, T, C, J, ...]. smoothing: whether later frames count too. progress: show a bar.
+            waited: frames for which the first one has waited for a second camera already.
         """
         n_frames = frames.pixels.shape[1]
         stream: KeypointStream | None = None
         poses, corrected = [], []
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
             frame = frames.map(lambda value: value[:, t])  # noqa: B023
-            stream, pose, found = self.advance(stream, frame)
+            stream, pose, found = self.advance(stream, frame, waited=waited)
             poses.append(pose)
             if smoothing:
                 corrected.append(found)
@@ -122,51 +150,154 @@ class KeypointTracker(nn.Module):
         stream: KeypointStream | None,
         frame: KeypointFrame,
         predicted: BodyGaussian | None = None,
-    ) -> tuple[KeypointStream, KeypointPoses, CorrectedBody]:
+        waited: float = 0.0,
+    ) -> KeypointStep:
         """Track one more frame; the first one begins where there is no stream yet.
 
         Args:
             stream: of the frame before. frame: the keypoints. predicted: the states of the stream one frame
-                later, if they are known already.
+                later, if they are known already. waited: frames that the first one has waited for already.
 
         Returns:
             The next stream, the poses of the frame [B, ...], and what the correction gave.
         """
+        step = self._advanced(stream, frame, predicted, waited)
+        return step if self.lifter is not None else self._with_lone_cameras(stream, frame, step)
+
+    def _advanced(
+        self,
+        stream: KeypointStream | None,
+        frame: KeypointFrame,
+        predicted: BodyGaussian | None,
+        waited: float,
+    ) -> KeypointStep:
+        """Return the next frame by all cameras together."""
         memory, lifted = self._lifted(stream, frame)
-        waited = frame.inlier.new_zeros(len(frame.inlier)) if stream is None else stream.lost
-        enough = self._enough(frame, waited)
+        count = frame.inlier.new_full((len(frame.inlier),), waited)
+        enough = self._enough(frame, count if stream is None else stream.lost)
         if stream is None:
-            due = enough
+            due, nobody = enough, torch.full_like(enough, NOBODY, dtype=torch.long)
             found = self._started(frame, lifted)
-            stream = KeypointStream(found.state, enough, torch.zeros_like(waited), memory)
+            stream = KeypointStream(found.state, enough, torch.zeros_like(count), nobody, memory)
         else:
             predicted = self.filter.predict(stream.state) if predicted is None else predicted
             found = self._followed(frame, lifted, predicted)
             due = ~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps)
             if lifted is not None:
                 due = due | contradicts(lifted, self.filter, predicted)
-            due = enough & due
+            due = enough & (due | self._seen_again(stream, frame))
             if bool(due.any()):
                 found = self._begun_anew(found, frame, lifted, due)
-            stream = KeypointStream(
-                found.state, stream.begun | due, torch.where(due, 0.0, stream.lost), memory
-            )
+            lost, alone = torch.where(due, 0.0, stream.lost), torch.where(due, NOBODY, stream.alone)
+            stream = KeypointStream(found.state, stream.begun | due, lost, alone, memory)
         inlier = found.weighed.own + found.weighed.other
         stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
         pose = KeypointPoses(
-            found.joints, self._lasting(found.joint_cov), found.state.mean, found.state.cov, inlier,
-            found.weighed.exchanged, found.log_evidence,
-            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due,
+            found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
+            found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
+            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due, stream.alone,
         )  # fmt: skip
         return stream, pose, found
 
+    def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:
+        """Return the frames in which tracking begins, T where it never does.
+
+        Args:
+            frames: [B, T, C, J, ...].
+        """
+        count = len(frames.pixels)
+        there = (frames.inlier > 0).flatten(2).any(-1)
+        waited = there.cumsum(-1) - there.long()
+        every = frames.map(lambda value: value.flatten(0, 1))
+        enough = self._enough(every, waited.flatten().to(every.inlier)).view(count, -1)
+        never = torch.ones_like(enough[:, :1])
+        return torch.cat([enough, never], -1).int().argmax(-1)
+
     def _enough(self, frame: KeypointFrame, waited: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
-        """Return whether tracking may begin: two cameras see the same joints, or have not for long."""
-        n_seeing = (frame.inlier > 0).sum(-2)
+        """Return whether tracking may begin: two cameras see the same joints, or one for long."""
+        there = frame.inlier > 0
         n_needed = min(2, frame.inlier.shape[-2])
-        patient = waited <= _PATIENCE * self.filter.fps
-        needed = torch.where(patient, n_needed, 1)
-        return (n_seeing >= needed[:, None]).sum(-1) >= LEAST_JOINTS
+        enough = (there.sum(-2) >= n_needed).sum(-1) >= LEAST_JOINTS
+        return enough | ((waited > _PATIENCE * self.filter.fps) & _sees_enough(there).any(-1))
+
+    # --- one of several cameras -------------------------------------------------------------------
+
+    def _with_lone_cameras(
+        self, before: KeypointStream | None, frame: KeypointFrame, step: KeypointStep
+    ) -> KeypointStep:
+        """Return the next frame with those whom one camera sees followed by that camera."""
+        stream, pose, _ = step
+        if not bool((pose.started | (stream.alone >= 0)).any()):
+            return step
+        there = frame.inlier > 0
+        fresh = pose.started & ~self._triangulated(frame).any(-1) & _sees_enough(there).any(-1)
+        alone = torch.where(fresh, there.sum(-1).argmax(-1), stream.alone)
+        for camera in alone[alone >= 0].unique().tolist():
+            for begins in (True, False):
+                rows = ((alone == camera) & (fresh == begins)).nonzero().squeeze(-1)
+                own = None if begins or before is None else taken(before, rows)
+                if len(rows):
+                    after = self._by_camera(camera, own, frame.take(rows), taken(step, rows))
+                    step = mapped(lambda old, new, at=rows: old.index_copy(0, at, new), step, after)
+        return step
+
+    def _by_camera(
+        self,
+        camera: int,
+        before: KeypointStream | None,
+        frame: KeypointFrame,
+        step: KeypointStep,
+    ) -> KeypointStep:
+        """Return the next frame of persons followed by one camera, in place of what all cameras gave."""
+        stream, pose, found = step
+        own = None if before is None else self._own(before, camera)
+        seen = frame_of(frame, camera, self.lone.widening)
+        after, one, by_one = self._lone_tracker(camera, frame).advance(own, seen)
+        state = by_one.state._replace(
+            log_odds=into_all(found.state.log_odds, by_one.state.log_odds, camera),
+            scale=into_all(found.state.scale, by_one.state.scale, camera),
+        )
+        alone = torch.full_like(stream.alone, camera)
+        lost = after.lost
+        if before is not None:
+            there = _sees_enough(frame.inlier > 0)
+            gone = ~(seen.inlier > 0).flatten(1).any(-1) & there.any(-1)
+            lost = torch.where(gone, before.lost + 1, lost)
+        stream = KeypointStream(state, after.begun, lost, alone, after.memory)
+        pose = one._replace(
+            covariance=self._unsure(by_one.joint_cov, by_one.joints, alone),
+            inlier=into_all(torch.zeros_like(pose.inlier), one.inlier, camera),
+            exchanged=into_all(pose.exchanged, one.exchanged, camera),
+            alone=alone,
+        )
+        found = by_one._replace(state=state, weighed=found.weighed)
+        return stream, pose, found
+
+    def _own(self, stream: KeypointStream, camera: int) -> KeypointStream:
+        """Return a stream as one camera has it for which there is no other."""
+        state, alone = state_of(stream.state, camera), torch.full_like(stream.alone, NOBODY)
+        return stream._replace(state=state, alone=alone)
+
+    def _lone_tracker(self, camera: int, frame: KeypointFrame) -> "KeypointTracker":
+        """Return what tracks by one of the cameras alone; it is set up when it is needed first."""
+        device = frame.pixels.device
+        if camera not in self._lone_trackers:
+            self._lone_trackers[camera] = KeypointTracker(
+                self._rig[0].select([camera]).to(device), self.filter.fps,
+                of_one_camera(self.filter.motion), self.filter.n_iterations, self.filter.upright,
+            )  # fmt: skip
+        return self._lone_trackers[camera].to(device)
+
+    def _seen_again(self, stream: KeypointStream, frame: KeypointFrame) -> Bool[Tensor, " B"]:
+        """Return on whose bodies cameras agree that one camera had to guess."""
+        alone = stream.alone >= 0
+        if not bool(alone.any()):
+            return alone
+        return alone & (self._triangulated(frame).sum(-1) >= LEAST_JOINTS)
+
+    def _triangulated(self, frame: KeypointFrame) -> Bool[Tensor, "B J"]:
+        """Return on which joints cameras agree."""
+        return triangulate(self.filter.maps, frame).isfinite().all(-1)
 
     # --- one frame --------------------------------------------------------------------------------
 
@@ -175,9 +306,13 @@ class KeypointTracker(nn.Module):
     ) -> tuple[Float[Tensor, "B L W"], Lifted | None]:
         """Return what the network keeps in mind, and what it lifts in a frame of one camera."""
         if self.lifter is None:
-            return frame.inlier.new_zeros(len(frame.inlier), 0, 0), None
+            return self._no_memory(frame) if stream is None else stream.memory, None
         lifted, memory = self.lifter(frame, None if stream is None else stream.memory)
         return memory, lifted
+
+    def _no_memory(self, frame: KeypointFrame) -> Float[Tensor, "B L W"]:
+        """Return what a network keeps in mind that has seen nothing."""
+        return torch.zeros(len(frame.inlier), *MEMORY, device=frame.inlier.device)
 
     def _followed(
         self, frame: KeypointFrame, lifted: Lifted | None, predicted: BodyGaussian
@@ -205,9 +340,20 @@ class KeypointTracker(nn.Module):
         theirs = None if lifted is None else taken(lifted, persons)
         return found.put(persons, self._started(frame.take(persons), theirs))
 
-    def _lasting(self, joint_cov: Float[Tensor, "*batch J 3 3"]) -> Float[Tensor, "*batch J 3 3"]:
-        """Return covariances of joints with what frames do not average out."""
-        return joint_cov + self.lasting_std**2 * torch.eye(3).to(joint_cov)
+    def _unsure(
+        self,
+        joint_cov: Float[Tensor, "*batch J 3 3"],
+        joints: Float[Tensor, "*batch J 3"],
+        alone: Int[Tensor, "*batch"],
+    ) -> Float[Tensor, "*batch J 3 3"]:
+        """Return covariances of joints with what frames do not average out, and one camera does not tell."""
+        lasting = self.lasting_std**2 * torch.eye(3).to(joint_cov)
+        if not bool((alone >= 0).any()):
+            return joint_cov + lasting
+        std = std_of_legs(self.filter.motion)
+        wider = of_any_size(joint_cov, joints, alone, self.filter.maps, std)
+        lone = self.lone.lasting_std**2 * torch.eye(3).to(joint_cov)
+        return wider + torch.where((alone >= 0)[..., None, None, None], lone, lasting)
 
     def _lost(
         self, stream: KeypointStream, frame: KeypointFrame, weighed: Weighed
@@ -241,8 +387,13 @@ class KeypointTracker(nn.Module):
         cov = result.cov.transpose(0, 1)
         joints, jacobian = self.filter.articulation.linearise(point)
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
-        joint_cov = self._lasting(joint_cov)
+        joint_cov = self._unsure(joint_cov, joints, filtered.alone)
         return filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
+
+
+def _sees_enough(there: Bool[Tensor, "B C J"]) -> Bool[Tensor, "B C"]:
+    """Return which cameras see enough joints of a person for a start by themselves."""
+    return there.sum(-1) >= LEAST_JOINTS
 
 
 def stacked(poses: Sequence[Any]) -> Any:

@@ -11,7 +11,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.errors import SkeletonError
 from torchpose.priors._body_motion import BodyMotion
 
-__all__ = ["length_of_legs", "of_one_camera", "with_body", "with_height"]
+__all__ = ["length_of_legs", "of_one_camera", "std_of_legs", "with_body", "with_height"]
 
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
@@ -62,6 +62,12 @@ def length_of_legs(motion: BodyMotion) -> float:
     lengths = body.offsets.norm(dim=-1) * motion.scale_mean[body.group].exp().to(body.offsets)
     legs = [j for j, name in enumerate(BODY_15.names) if name.endswith(_LEGS)]
     return float(lengths[legs].sum()) / 2
+
+
+def std_of_legs(motion: BodyMotion) -> float:
+    """Return the standard deviation of the log of the legs' length."""
+    told = _of_legs(motion)
+    return float((told @ motion.scale_cov @ told).clamp_min(0).sqrt())
 
 
 def _of_legs(motion: BodyMotion) -> Tensor:

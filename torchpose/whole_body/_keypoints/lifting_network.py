@@ -17,6 +17,7 @@ from torchpose.body._skeleton import BODY_15
 
 __all__ = [
     "INPUTS",
+    "MEMORY",
     "Lifted",
     "LiftingNetwork",
     "LiftingNetworkInfo",
@@ -29,6 +30,8 @@ _JOINTS = len(BODY_15.names)
 INPUTS = 4 * _JOINTS + 4
 """Number of `lifting_features`."""
 _WIDTH, _LAYERS = 256, 2
+MEMORY = (_LAYERS, _WIDTH)
+"""Sizes of what a network keeps in mind."""
 _UNIT = 0.3  # metres of an output
 _RATE, _RATES = 60.0, (0.25, 1.0)  # frames per second of an input, and its limits
 _FARTHEST, _SMALLEST = 5.0, 1e-3  # extents of a body from its middle; extent of a ray

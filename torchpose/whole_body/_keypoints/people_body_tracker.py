@@ -130,8 +130,7 @@ class PeopleBodyTracker:
         keypoints: KeypointFrame = stacked([one.keypoints for one in found])
         if smoothing:
             poses = self.single.tracker.smoothed(poses, [one.corrected for one in found])
-        track = self.single.track(poses, keypoints, 0, summed_up)
-        track.first_frame = rows[0].time
+        track = self.single.track(poses, keypoints, 0, summed_up, first_frame=rows[0].time)
         track.details["detection"] = torch.cat([one.detection for one in found])
         track.details["person"] = torch.full((len(rows),), person)
         return track

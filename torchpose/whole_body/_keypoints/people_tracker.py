@@ -33,6 +33,7 @@ _SAME = 0.15  # metres between joints, on average, below which two persons are o
 _SAME_TIME = 0.2  # seconds of that
 _DOUBT = 25.0  # factor of the variance of keypoints of a camera that nobody's body explains
 _LEAST_INLIERS = 0.5  # share of the keypoints of a start that must be those of a body
+_AS_WELL = 0.95  # the same share of who begins anew, against that of the body as it was followed
 
 
 class PeopleStream(NamedTuple):
@@ -159,41 +160,42 @@ class PeopleTracker:
         """Return the stream and the frame with persons who begin in it.
 
         One whom a single camera saw, and whose keypoints there agree with others that nobody explains, begins
-        anew with them and stays the same person.
+        anew with them and stays the same person, if one body explains all of them as well. Two such persons
+        whose keypoints seem to agree stay where they are.
         """
         groups = group_detections(self.tracker.filter.maps, frame, free)
-        former = torch.full_like(groups[:, 0], -1)
-        identity = torch.zeros_like(former)
-        if found is not None and len(groups):
-            owner = ((found.detection[:, None] == groups) & (groups >= 0)).any(-1) & weak[:, None]
-            row = owner.to(torch.uint8).argmax(0)
-            former = torch.where(owner.any(0), stream.number[row], -1)
-            identity = torch.where(owner.any(0), stream.identity[row], 0)
-            keep = (~owner.any(-1)).nonzero().squeeze(-1)
-            stream, found = self._kept(stream, keep), taken(found, keep)
-        room = None if self.most is None else max(self.most - len(stream.number), 0)
-        groups, former, identity = groups[:room], former[:room], identity[:room]
+        owner = _owners(groups, found, weak)
+        again = (owner & (owner.cumsum(1) > 1)).any(0)  # a second group of the same person
+        chosen = (owner.sum(0) <= 1) & ~again & self._has_room(~owner.any(0), len(stream.number))
+        groups, owner = groups[chosen], owner[:, chosen]
         if not len(groups):
-            return stream, found if found is not None and len(found.number) else None
+            return stream, found
         keypoints = taken_detections(frame, groups)
         bodies, poses, corrected = self.tracker.advance(None, keypoints)
-        count = (keypoints.inlier > 0).sum((-2, -1))
-        sure = poses.inlier.sum((-2, -1)) >= _LEAST_INLIERS * count
+        sure = _explained(poses, keypoints) >= _needed(owner, found)
+        former, identity = _owned_by(stream.number, owner, -1), _owned_by(stream.identity, owner, 0)
         number = torch.arange(len(groups), device=groups.device) + stream.n_begun
         number = torch.where(former >= 0, former, number)
         begun = PeopleFrame(number, identity, groups, keypoints, poses, corrected)
         zero = poses.log_evidence.new_zeros(len(groups))
+        n_begun = stream.n_begun + len(groups)
         beginners = PeopleStream(
-            bodies, number, stream.n_begun + len(groups), zero, zero, zero, zero, identity,
-            stream.n_confirmed,
-        )  # fmt: skip
-        rows = sure.nonzero().squeeze(-1)
-        beginners, begun = self._kept(beginners, rows), taken(begun, rows)
+            bodies, number, n_begun, zero, zero, zero, zero, identity, stream.n_confirmed
+        )
+        rows, keep = (flags.nonzero().squeeze(-1) for flags in (sure, ~owner[:, sure].any(-1)))
+        stream = self._kept(stream, keep)._replace(n_begun=n_begun)
         if not len(rows):
-            return stream._replace(n_begun=beginners.n_begun), found
+            return stream, found
+        beginners, begun = self._kept(beginners, rows), taken(begun, rows)
         if stream.bodies is None or found is None:
             return beginners, begun
-        return _joined(stream, beginners), _joined(found, begun)
+        return _joined(stream, beginners), _joined(taken(found, keep), begun)
+
+    def _has_room(self, new: Bool[Tensor, " G"], count: int) -> Bool[Tensor, " G"]:
+        """Return which groups may begin: persons who are there already, and others up to the most."""
+        if self.most is None:
+            return torch.ones_like(new)
+        return ~new | (new.cumsum(0) <= self.most - count)
 
     # --- who is confirmed, who has left -----------------------------------------------------------
 
@@ -241,6 +243,38 @@ class PeopleTracker:
 def _nobody(frame: KeypointFrame) -> PeopleStream:
     none = frame.inlier.new_zeros(0)
     return PeopleStream(None, none.long(), 0, none, none, none, none, none.long(), 0)
+
+
+def _owners(
+    groups: Int[Tensor, "G C"], found: PeopleFrame | None, weak: Bool[Tensor, " P"]
+) -> Bool[Tensor, "P G"]:
+    """Return whose detections, of persons who may give theirs up, are in which groups."""
+    if found is None:
+        return weak[:, None].expand(-1, len(groups))
+    shared = (found.detection[:, None] == groups) & (groups >= 0)
+    return shared.any(-1) & weak[:, None]
+
+
+def _owned_by(
+    values: Int[Tensor, " P"], owner: Bool[Tensor, "P G"], nobody: int
+) -> Int[Tensor, " G"]:
+    """Return a value of the only owner of each group."""
+    own = (values[:, None] * owner).sum(0)
+    return torch.where(owner.any(0), own, nobody)
+
+
+def _explained(poses: KeypointPoses, keypoints: KeypointFrame) -> Float[Tensor, " P"]:
+    """Return the share of persons' keypoints that are those of their bodies."""
+    count = (keypoints.inlier > 0).sum((-2, -1)).clamp_min(1)
+    return poses.inlier.sum((-2, -1)) / count
+
+
+def _needed(owner: Bool[Tensor, "P G"], found: PeopleFrame | None) -> Float[Tensor, " G"] | float:
+    """Return the share of the keypoints of starts that must be those of a body."""
+    if found is None:
+        return _LEAST_INLIERS
+    followed = _AS_WELL * _explained(found.poses, found.keypoints)
+    return (followed[:, None] * owner).sum(0).clamp_min(_LEAST_INLIERS)
 
 
 def _owned(chosen: Int[Tensor, "P C"], there: Bool[Tensor, "C D"]) -> Bool[Tensor, "C D"]:
