@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_rate, check_shape
+from torchpose._core.checks import check_floating, check_rate, check_shape
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.moved import warn_of_former
@@ -58,12 +58,13 @@ class BodyStream(NamedTuple):
 
     Attributes:
         filter: state of the filter; None before the first keypoints. frame: number of the next frame.
-        generator: of random numbers.
+        generator: of random numbers. names: of the keypoints of every frame that states none.
     """
 
     filter: BodyFilterState | KeypointStream | PeopleStream | None
     frame: int
     generator: torch.Generator | None
+    names: tuple[str, ...] | None = None
 
 
 class BodyTracker(nn.Module):
@@ -313,6 +314,7 @@ class BodyTracker(nn.Module):
                 )
             if keypoints is None:
                 raise InputError(f"method {self.method} takes keypoints, got none")
+            check_floating("keypoints", keypoints)
             _refuse_given(
                 self.method, initial_state=initial_state, generator=generator, lengths=lengths,
                 facing=facing, n_frames=n_frames,
@@ -369,8 +371,8 @@ class BodyTracker(nn.Module):
     ) -> BodyStream:
         """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
 
-        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument;
-        keypoints may be given.
+        A stream of "kalman" begins with the first frame that has enough keypoints, and needs no argument.
+        `names` given here hold for all frames.
 
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
@@ -391,7 +393,7 @@ class BodyTracker(nn.Module):
                 self.method, silhouettes=silhouettes, initial_state=initial_state,
                 generator=generator, facing=facing,
             )  # fmt: skip
-            return BodyStream(None, 0, None)
+            return BodyStream(None, 0, None, _names(names))
         if initial_state is None:
             if silhouettes is None and keypoints is None:
                 raise InputError(
@@ -400,7 +402,7 @@ class BodyTracker(nn.Module):
             given = given_keypoints(keypoints, confidence, names, covariance)
             frames = list(self._by_particles.observed(silhouettes, given)[0])
             initial_state = self._by_particles.first_state(frames, generator, facing)
-        return self._begun(initial_state, generator)
+        return self._begun(initial_state, generator)._replace(names=_names(names))
 
     def _begun(self, initial_state: Tensor, generator: torch.Generator | None) -> BodyStream:
         """Return the state of particles before the first frame."""
@@ -462,6 +464,7 @@ class BodyTracker(nn.Module):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
+        names = _stream_names(state, names)
         if self.by_keypoints is None:
             self._check_kind("none", "none", persons)
             given = given_keypoints(keypoints, confidence, names, covariance)
@@ -470,6 +473,7 @@ class BodyTracker(nn.Module):
             return self._tracked(state, self._by_particles.observed(shown, given)[0])
         if keypoints is None:
             raise InputError(f"method {self.method} takes keypoints, got none")
+        check_floating("keypoints", keypoints)
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         if (isinstance(state.filter, PeopleStream) != (persons is not None)) and state.filter:
@@ -481,7 +485,7 @@ class BodyTracker(nn.Module):
             state.filter, keypoints, confidence, names, covariance=covariance
         )
         pose.first_frame = state.frame
-        return BodyStream(after, state.frame + 1, None), pose
+        return state._replace(filter=after, frame=state.frame + 1), pose
 
     @torch.no_grad()
     def advance(
@@ -506,6 +510,7 @@ class BodyTracker(nn.Module):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
+        names = _stream_names(state, names)
         if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
@@ -533,7 +538,7 @@ class BodyTracker(nn.Module):
         after, poses = self._by_particles.follow(state.filter, frames, state.generator, state.frame)
         poses.fps, poses.method = self.fps, self.method
         poses.notes = (*self.notes, *poses.notes)
-        return BodyStream(after, state.frame + len(poses), state.generator), poses
+        return state._replace(filter=after, frame=state.frame + len(poses)), poses
 
     def _step_people(
         self,
@@ -552,7 +557,7 @@ class BodyTracker(nn.Module):
         )
         for pose in poses:
             pose.first_frame = state.frame
-        return BodyStream(after, state.frame + 1, None), poses
+        return state._replace(filter=after, frame=state.frame + 1), poses
 
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
@@ -562,6 +567,24 @@ def _refuse(unused: Sequence[str], where: str) -> None:
     """Raise `InputError` for arguments that the method does not use."""
     if unused:
         raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
+
+
+def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:
+    return None if names is None else tuple(names)
+
+
+def _stream_names(state: BodyStream, names: Sequence[str] | None) -> Sequence[str] | None:
+    """Return the names of a frame's keypoints: those given with it, else those given at first.
+
+    Raises:
+        InputError: what is no state.
+    """
+    if not isinstance(state, BodyStream):
+        raise InputError(
+            f"state must be a BodyStream, got {type(state).__name__}; begin with init, and pass on what the "
+            "step before returned"
+        )
+    return state.names if names is None else names
 
 
 def _refuse_given(method: str, **arguments: Any) -> None:

@@ -408,7 +408,7 @@ def test_a_known_body_keeps_its_bones(four, filtered):
         ({"keypoints": torch.zeros(3, 2, 15, 2)}, ShapeError, "keypoints"),
         ({"keypoints": torch.full((3, 4, 15, 2), torch.nan)}, NobodySeenError, "no keypoint"),
         ({"names": ["nose"] * 15}, SkeletonError, "nose"),
-        ({"confidence": torch.full((40, 4, 15), -1.0)}, InputError, "negative"),
+        ({"confidence": torch.full((40, 4, 15), -1.0)}, InputError, "in \\[0, 1\\]"),
         ({"confidence": torch.ones(40, 4, 3)}, ShapeError, "confidence"),
         ({"covariance": torch.zeros(40, 4, 15)}, InputError, "covariance"),
         ({"smoothing": "some"}, InputError, "smoothing"),
@@ -490,6 +490,45 @@ def test_arguments_of_other_methods_are_refused():
     for name, value in unused.items():
         with pytest.raises(InputError, match=name):
             kalman.init(**{name: value})
+
+
+def test_names_of_a_stream_hold_for_all_frames(four):
+    order = torch.arange(15).flip(0)
+    names = [NAMES[j] for j in order.tolist()]
+    kalman = tracker(four.rig)
+    given, stated = kalman.init(names=names), kalman.init()
+    for t in range(4):
+        frame = {"keypoints": four.keypoints[t][:, order], "confidence": four.confidence[t]}
+        given, pose = kalman.step(given, **frame)
+        stated, same = kalman.step(stated, **frame, names=names)
+        torch.testing.assert_close(pose.joints3d, same.joints3d, rtol=0, atol=0)
+    assert float((pose.joints3d[0] - four.joints[3]).norm(dim=-1).mean()) < 0.03
+    other = BodyTracker(four.rig, "sir", height=1.7, n_particles=50)
+    assert other.init(initial_state=torch.zeros(36).double(), names=names).names == tuple(names)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"keypoints": lambda k: k.numpy()}, InputError, "floating-point tensor, got ndarray"),
+        ({"confidence": lambda c: 100 * c}, InputError, "divide scores in percent by 100"),
+        ({"keypoints": lambda k: k.repeat(1, 1, 2, 1)}, ShapeError, "BODY_15, whose names count"),
+    ],
+)
+def test_what_keypoints_are_is_said(four, changes, error, said):
+    given = {"keypoints": four.keypoints, "confidence": four.confidence}
+    given = {name: changes.get(name, lambda v: v)(value) for name, value in given.items()}
+    with pytest.raises(error, match=said):
+        tracker(four.rig)(**given)
+
+
+def test_a_height_in_centimetres_and_no_state_are_refused(four):
+    with pytest.raises(InputError, match=r"height must lie between 0\.5 and 2\.6 m, got 175"):
+        tracker(four.rig, height=175)
+    with pytest.raises(
+        InputError, match="state must be a BodyStream, got NoneType; begin with init"
+    ):
+        tracker(four.rig).step(None, keypoints=four.keypoints[0])
 
 
 def test_a_keypoint_that_is_of_no_ray_is_missing():

@@ -8,7 +8,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_choice, check_positive, check_shape
+from torchpose._core.checks import (
+    check_choice,
+    check_floating,
+    check_height,
+    check_positive,
+    check_shape,
+)
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
@@ -99,7 +105,7 @@ class KeypointBodyTracker(nn.Module):
         if body is not None:
             motion = with_body(motion, body)
         elif height is not None:
-            motion = with_height(motion, check_positive("height", height))
+            motion = with_height(motion, check_height(height))
         if alone:
             motion = of_one_camera(motion)
         self.sized = body is not None or height is not None
@@ -212,18 +218,23 @@ class KeypointBodyTracker(nn.Module):
         covariance: Tensor | None,
     ) -> KeypointFrame:
         """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
-        names = BODY_15.names if names is None else tuple(names)
+        names = _names_of(keypoints, names)
         shape = keypoints.shape[:-1]
-        check_shape("keypoints", keypoints, ["...", len(names), 2])
         for name, value in (("confidence", confidence), ("covariance", covariance)):
             if value is not None:
+                check_floating(name, value)
                 check_shape(name, value, list(shape))
         points = keypoints.to(self.rig.matrix)
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
-        if not bool((trust.nan_to_num(0) >= 0).all()):
-            raise InputError(f"confidence must not be negative, got {float(trust.min()):g}")
-        trust = trust.nan_to_num(0.0).clamp_max(1.0)
-        there = torch.isfinite(points).all(-1) & (trust > 0)
+        trust = trust.nan_to_num(0.0)
+        known = torch.isfinite(points).all(-1)
+        outside = known & ((trust < 0) | (trust > 1))
+        if bool(outside.any()):
+            raise InputError(
+                f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "
+                "divide scores in percent by 100"
+            )
+        there = known & (trust > 0)
         own = self.pixel_std**2 * torch.ones_like(trust)
         relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
         if covariance is not None:
@@ -349,6 +360,18 @@ class KeypointBodyTracker(nn.Module):
         exchange = self.tracker.filter.exchange
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
         return (*notes, *notes_on_cameras(self.rig.names, doubts))
+
+
+def _names_of(keypoints: Tensor, names: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of keypoints [..., J, 2], those of `BODY_15` if none are given."""
+    found = BODY_15.names if names is None else tuple(names)
+    if keypoints.shape[-2:] != (len(found), 2):
+        of = "BODY_15, whose names count where none are given" if names is None else "names"
+        raise ShapeError(
+            f"keypoints must have shape [..., {len(found)}, 2], as many as {of}, got "
+            f"{list(keypoints.shape)}"
+        )
+    return found
 
 
 def _rigid_body(bones: Float[Tensor, "T J 3"], measured: Bool[Tensor, " T"]) -> Body:

@@ -48,7 +48,7 @@ def notes_of(
     for c, name in enumerate(cameras):
         count = int(there[:, c].sum())
         if count == 0:
-            notes.append(f"camera {name} has no keypoint in any frame")
+            notes.append(f"camera {name} has no keypoint of this person in any frame")
             continue
         astray = 1 - float(inlier[:, c][there[:, c]].mean())
         if astray > _DISAGREES:
