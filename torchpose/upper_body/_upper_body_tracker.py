@@ -246,7 +246,8 @@ class UpperBodyTracker(WideModule):
             generator: the generator of methods that draw, or a list of one for each sequence.
             lengths: [B], the number of frames of each sequence. progress: whether to show a bar.
             covariance: [B, T, J, 2, 2], the covariance of each keypoint in pixels squared, in place of
-                `measurement_std`; that of a missing keypoint is ignored. Frames with the same
+                `measurement_std`; that of a keypoint that is missing or none of the eight joints is
+                ignored. Frames with the same
                 covariances share work.
             absent: [B, T, J], the probability that a missing hand cannot be seen, because it is hidden or
                 outside of the image, as a detector has it at even odds; NaN where nothing is known. A hand
