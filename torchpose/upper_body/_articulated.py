@@ -129,8 +129,9 @@ class ArticulatedFilter(Estimator):
         model: the model of the tracker.
         arms: the prior over arms, or its file; by default the one that comes with the package.
         bone_lengths: the lengths that were measured on the person, metres: any of upper_arm, forearm (to
-            the measured hand or wrist), shoulder_width and head_height (above the neck). The others are
-            expected in proportion.
+            the measured hand or wrist), shoulder_width and head_height (above Kinect's neck, which is
+            10.5 cm above the middle of the shoulders, whatever neck is measured). The others are expected
+            in proportion.
         height: the height of the person, metres.
         person: poses of the same person, or the file that `PoseTrack.save` wrote, of which the last
             lengths are taken.
