@@ -392,7 +392,7 @@ class UpperBodyTracker(WideModule):
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
         """Return the notes about the choice of the method and about the kinds of neck and hands."""
         chosen = self.notes if method == self.method else ()
-        return chosen + picked.notes + (() if estimator.knows_wrists else picked.of_hands)
+        return chosen + picked.notes + picked.hand_notes(estimator.knows_wrists)
 
     def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
         info = self.prior.info
