@@ -185,3 +185,14 @@ def test_bad_streams_are_refused(prior, change, error, message):
     with pytest.raises(error, match=message):
         state = tracker.init(change.get("batch_size", 2), change.get("names", NAMES))
         tracker.step(state, frame, change.get("confidence"), change.get("mask"))
+
+
+def test_states_of_something_else_are_refused(prior, few):
+    tracker, other = (UpperBodyTracker(prior, demo_camera(), m) for m in (None, "mkf-fixed"))
+    for state in (None, (1, 2)):
+        with pytest.raises(InputError, match=r"state must be a StreamState, got .*begin with init"):
+            tracker.step(state, few[:, 0])
+        with pytest.raises(InputError, match="state must be a StreamState"):
+            tracker.advance(state, few)
+    with pytest.raises(InputError, match=r"of method 'mkf-fixed', .* got one of 'multiple-model'"):
+        other.step(tracker.init(len(few), NAMES), few[:, 0])

@@ -118,6 +118,15 @@ def test_lengths_that_no_sequence_has_are_refused(prior, scene, lengths):
         UpperBodyTracker(prior, demo_camera())(batch, names=NAMES, lengths=torch.tensor(lengths))
 
 
+def test_lengths_may_be_a_list(prior, scene):
+    batch = scene[1][None, :20].expand(2, -1, -1, -1)
+    tracker = UpperBodyTracker(prior, demo_camera(), "mkf-fixed")
+    found = tracker(batch, names=NAMES, lengths=[20, 12])
+    assert torch.equal(found.lengths, torch.tensor([20, 12]))
+    with pytest.raises(InputError, match="number of frames of each sequence, got 'all'"):
+        tracker(batch, names=NAMES, lengths="all")
+
+
 def test_names_may_come_in_any_order_and_subset(prior, scene, plain):
     keypoints = scene[1][:40]
     tracker = UpperBodyTracker(prior, demo_camera())
@@ -289,6 +298,7 @@ def test_files_of_older_releases_do_not_say_what_ran(prior, scene, tmp_path):
     ("options", "error", "message"),
     [
         ({"camera": None}, CameraError, "a camera is needed"),
+        ({"camera": "525,525,319.5,239.5"}, CameraError, "a PinholeCamera, got str"),
         ({"method": "mkf"}, InputError, "mkf-fixed"),
         ({"smoothing": "half"}, InputError, "smoothing"),
         ({"smoothing": -1}, InputError, "smoothing"),
@@ -334,6 +344,7 @@ def test_a_prior_of_another_kind_is_refused(prior):
     ("change", "error", "message"),
     [
         ({"keypoints": torch.zeros(10, 4, 2)}, ShapeError, "keypoints"),
+        ({"keypoints": np.zeros((1, 10, 4, 2))}, InputError, "got ndarray; convert it"),
         ({"keypoints": torch.zeros(1, 0, 4, 2)}, InputError, "at least one"),
         ({"keypoints": torch.full((1, 10, 4, 2), float("inf"))}, InputError, "finite"),
         (

@@ -25,6 +25,7 @@ from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torc
 __all__ = [
     "MeasuredJoints",
     "arm_measurements",
+    "as_lengths",
     "block_diagonal",
     "check_gaps",
     "check_sequences",
@@ -288,6 +289,21 @@ def check_sequences(keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
             f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
         )
     return keypoints
+
+
+def as_lengths(lengths: Tensor | Sequence[int]) -> Tensor:
+    """Return the numbers of frames of sequences as a tensor; `check_gaps` looks at their values.
+
+    Raises:
+        InputError: what holds no numbers.
+    """
+    try:
+        return torch.as_tensor(lengths)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"lengths must hold the number of frames of each sequence, got {lengths!r}; pass a tensor or a "
+            "list of whole numbers"
+        ) from error
 
 
 def check_gaps(
