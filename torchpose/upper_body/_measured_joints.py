@@ -83,9 +83,15 @@ class MeasuredJoints(NamedTuple):
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
-    """Return the scale of the prior's camera at the neck of its mean pose."""
-    depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
-    return math.sqrt(prior.info.fx * prior.info.fy) / depth
+    """Return the scale of the prior's camera at the neck of its mean pose; computed once for each prior."""
+    info = prior.info
+
+    def make() -> float:
+        depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
+        return math.sqrt(info.fx * info.fy) / depth
+
+    sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple())
+    return derived(prior, ("pixels per metre", info.fx, info.fy), sources, make)
 
 
 def place_measured_neck(
