@@ -124,6 +124,16 @@ def test_mean_of_both_signs_of_a_half_turn():
     assert mean.abs().tolist() == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
 
 
+def test_a_mean_that_is_lost_stays_alone():
+    vectors = torch.tensor([[0.1, 0.2, 0.3], [0.0, 0.5, 0.1]], dtype=torch.float64).repeat(3, 1, 1)
+    weights = torch.tensor([[0.5, 0.5], [0.5, 0.5], [math.nan, 0.5]], dtype=torch.float64)
+    expected = mean_rotation(vectors[0], weights[0])
+    vectors[1, 0, 2] = math.nan
+    mean = mean_rotation(vectors, weights)
+    torch.testing.assert_close(mean[0], expected)
+    assert bool(mean[1:].isnan().all())
+
+
 def test_wrong_sizes_are_named():
     with pytest.raises(ShapeError, match="vector must have shape"):
         quaternion_vector_to_matrix(torch.zeros(4))

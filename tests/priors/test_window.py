@@ -106,6 +106,23 @@ def test_lags_follow_the_frame_rate():
     assert LAYOUT.ahead == 1 and WindowLayout((4,), (0,)).ahead == 0
 
 
+@pytest.mark.parametrize(
+    ("fps", "repeated"),
+    [(30.0, ()), (10.0, ()), (3.0, (0,)), (2.0, (0, 2)), (1.0, (0, 1, 4))],
+)
+def test_lags_of_one_frame_are_measured_once(fps, repeated):
+    """Own hands of the present frame are measured as the arm's own, and of others the nearest is taken."""
+    layout = WindowLayout((4, 10, 20), (0, 10)).at_rate(fps)
+    assert layout.repeated == repeated
+    uv, mask = pixels(sequence(24))[None], torch.ones(1, 24, 8, dtype=torch.bool)
+    _, known = window_measurements(uv, mask, layout, "left", still_path(layout, 24))
+    assert known[0, -1].tolist() == [i not in repeated for i in range(5)]
+
+
+def test_of_lags_of_one_frame_the_nearest_is_measured():
+    assert WindowLayout((4, 8, 16, -4, -8, -16), (0, 8, -8)).at_rate(4.0).repeated == (0, 3)
+
+
 def test_augmented_bodies_keep_their_angles_and_their_symmetry():
     body = sequence()[:, None]
     other = augment_bodies(body, torch.Generator().manual_seed(0), size=0.2, bones=0.1)

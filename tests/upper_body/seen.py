@@ -15,5 +15,5 @@ def see_torso(rays, known, std):
     eye = torch.eye(3, dtype=rays.dtype)
     cov = std**2 * eye[:2, :2].expand(8, 2, 2)
     measured = MeasuredJoints(rays[:, None, :, :2] / rays[:, None, :, 2:], known[:, None], cov)
-    (frame,), (facts,) = split(as_rays(measured, eye)), facts_of(measured, eye)
+    (frame,), (facts,) = split(as_rays(measured, eye, eye)), facts_of(measured, eye)
     return upright(frame, facts, eye.expand(len(rays), 3, 3)).torso

@@ -202,7 +202,7 @@ def test_wrists_end_shorter_forearms_than_hands():
     for end in ("hand", "wrist"):
         names = [name.replace("hand", end) for name in UPPER_BODY]
         track = tracker()(uv, names=names)
-        assert track.notes == ()  # neither stands for the other
+        assert [("are the wrists" in note) for note in track.notes] == [True] * (end == "wrist")
         lengths.append(float(torch.linalg.vector_norm(bones(track.joints3d[0, 0], "left")[1])))
     assert lengths[1] < 0.85 * lengths[0]
 
@@ -248,6 +248,24 @@ def test_given_lengths_are_kept_and_the_others_go_with_them():
         before = torch.linalg.vector_norm(bones(usual, side)[0])
         assert float(upper) < float(before)
     assert float(given[ROW["neck"], 2]) < float(usual[ROW["neck"], 2])
+
+
+@pytest.mark.parametrize("neck", ["neck", "mid-shoulder"])
+def test_given_lengths_are_those_that_are_reported(neck):
+    """Whatever neck is measured, so that a person's lengths may be handed back."""
+    rows = [i for i, name in enumerate(UPPER_BODY) if not name.startswith("shoulder")]
+    joints = body(2)
+    if neck == "mid-shoulder":
+        joints[:, ROW["neck"]] = joints[:, [ROW["shoulder_left"], ROW["shoulder_right"]]].mean(1)
+    given = {"shoulder_width": 0.33, "head_height": 0.2}
+    names = [UPPER_BODY[i] for i in rows]
+    track = tracker(neck=neck, bone_lengths=given)(pixels(joints)[None, :, rows], names=names)
+    torch.testing.assert_close(track.bone_lengths[0, 0, 2:], torch.tensor([0.33, 0.2]).double())
+    again = dict(zip(("upper_arm", "forearm"), track.bone_lengths[0, 0].tolist(), strict=False))
+    handed = tracker(neck=neck, bone_lengths=given | again)(
+        pixels(joints)[None, :, rows], names=names
+    )
+    torch.testing.assert_close(handed.bone_lengths[0, 0], track.bone_lengths[0, 0])
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Frame by frame the tracker says what it says about whole sequences."""
 
+import copy
+
 import pytest
 import torch
 
@@ -7,6 +9,7 @@ from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, perform
 from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
+from torchpose.upper_body._measured_joints import pixels_per_metre
 
 NAMES = list(KEYPOINT_NAMES)
 FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
@@ -185,3 +188,35 @@ def test_bad_streams_are_refused(prior, change, error, message):
     with pytest.raises(error, match=message):
         state = tracker.init(change.get("batch_size", 2), change.get("names", NAMES))
         tracker.step(state, frame, change.get("confidence"), change.get("mask"))
+
+
+def test_states_of_something_else_are_refused(prior, few):
+    tracker, other = (UpperBodyTracker(prior, demo_camera(), m) for m in (None, "mkf-fixed"))
+    for state in (None, (1, 2)):
+        with pytest.raises(InputError, match=r"state must be a StreamState, got .*begin with init"):
+            tracker.step(state, few[:, 0])
+        with pytest.raises(InputError, match="state must be a StreamState"):
+            tracker.advance(state, few)
+    with pytest.raises(InputError, match=r"of method 'mkf-fixed', .* got one of 'multiple-model'"):
+        other.step(tracker.init(len(few), NAMES), few[:, 0])
+
+
+def test_what_no_step_changes_is_computed_once(prior, few, monkeypatch):
+    tracker = UpperBodyTracker(prior, demo_camera(), "articulated", neck="mid-shoulder")
+    state, _ = tracker.step(tracker.init(len(few), NAMES), few[:, 0])
+
+    def again(*_args, **_options):
+        raise AssertionError("computed in every step")
+
+    monkeypatch.setattr(torch.linalg, "inv", again)
+    monkeypatch.setattr(type(prior.left), "moments", again)
+    tracker.step(state, few[:, 1])
+
+
+def test_the_scale_of_a_prior_follows_its_mean_pose(prior):
+    own = copy.deepcopy(prior)
+    before = pixels_per_metre(own)
+    assert pixels_per_metre(own) == before == pixels_per_metre(prior)
+    for mixture in (own.left, own.right):
+        mixture.means[:, 14] *= 2
+    assert pixels_per_metre(own) == pytest.approx(before / 2)

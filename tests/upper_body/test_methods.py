@@ -247,7 +247,7 @@ def test_a_registered_filter_is_a_method_like_the_others(prior, keypoints, monke
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_forward_of_an_estimator_is_its_advance(prior, keypoints, method):
+def test_forward_of_an_estimator_is_its_advance(prior, keypoints, method, capsys):
     few = {"n_particles": 40} if "n_particles" in method_options(method) else {}
     tracker = UpperBodyTracker(prior, demo_camera(), method, **few)
     estimator, cov = tracker.estimator, tracker.measurement_cov
@@ -265,7 +265,7 @@ def test_forward_of_an_estimator_is_its_advance(prior, keypoints, method):
     for n in (1, 9, 30):
         rows = slice(start, start + n)
         part = measured._replace(uv=measured.uv[:, rows], mask=measured.mask[:, rows])
-        state, found = estimator.advance(state, part)
+        state, found = estimator.advance(state, part, progress=n == 30)
         for arm, expected in zip(found[:2], whole[:2], strict=True):
             torch.testing.assert_close(arm.mean, expected.mean[:, rows], rtol=1e-9, atol=1e-9)
             torch.testing.assert_close(
@@ -276,6 +276,7 @@ def test_forward_of_an_estimator_is_its_advance(prior, keypoints, method):
                 equal_nan=True,
             )
         start += n
+        assert ("frame" in capsys.readouterr().err) is (n == 30)  # the bar
 
 
 def test_windows_that_are_named_and_denied_are_refused(prior):

@@ -13,6 +13,8 @@ from torchpose.errors import FileFormatError
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
+from torchpose.upper_body._measured_joints import MeasuredJoints
+from torchpose.upper_body._screening import _screened
 
 NAMES = ["head", "neck", "hand_left", "hand_right"]
 ROWS = [UPPER_BODY.index(name) for name in NAMES]
@@ -268,3 +270,36 @@ def test_an_unsure_keypoint_is_believed_only_where_it_is_expected(tracker, keypo
     aside = tracker(moved_away, confidence, NAMES).inlier_probability[:, FRAME, ROWS[2]]
     assert bool((there > 0.5).all())
     assert bool((aside > 0.5).all()) is kept
+
+
+@pytest.mark.parametrize("method", ["articulated", "multiple-model"])
+def test_an_unsure_outlier_leaves_no_doubt_about_the_others(prior, keypoints, method):
+    tracker = UpperBodyTracker(prior, demo_camera(), method)
+    wild, hand = keypoints[:1, : FRAME + 2].clone(), NAMES.index("hand_left")
+    wild[:, FRAME, hand] = 20.0
+    sure = torch.ones(wild.shape[:3])
+    expected = tracker(wild, sure, NAMES)
+    sure[:, FRAME, hand] = 0.4
+    found = tracker(wild, sure, NAMES)
+    assert not bool(found.observed[:, FRAME, ROWS[hand]].any())
+    assert torch.equal(found.observed, expected.observed)
+    torch.testing.assert_close(found.covariance3d, expected.covariance3d)
+
+
+def test_the_confidence_of_a_joint_goes_where_the_joint_goes():
+    """Hands are exchanged back in the second of two frames, and the head is an outlier in both."""
+    left, head, right = (UPPER_BODY.index(n) for n in ("hand_left", "head", "hand_right"))
+    sure = torch.linspace(0.2, 0.9, 8).repeat(1, 2, 1)
+    cov = torch.eye(2).double().expand(1, 2, 8, 2, 2)
+    measured = MeasuredJoints(
+        torch.ones(1, 2, 8, 2).double(), torch.ones(1, 2, 8, dtype=torch.bool), cov, confidence=sure
+    )
+    joints = torch.arange(8).repeat(1, 2, 1)
+    joints[0, 1, [left, right]] = torch.tensor([right, left])
+    probability = torch.ones(1, 2, 8).double()
+    probability[..., head] = 0.1
+    found = _screened(measured, probability, joints).confidence
+    expected = sure.clone()
+    expected[0, 1, [left, right]] = sure[0, 1, [right, left]]
+    expected[..., head] = 1.0
+    assert torch.equal(found, expected)

@@ -53,14 +53,62 @@ def test_gradients_are_finite_everywhere():
     assert places.grad is not None and bool(places.grad.isfinite().all())
 
 
+def test_a_torso_whose_shoulders_are_on_one_ray_has_a_width():
+    middle = torch.tensor([0.0, 0.0, FAR], dtype=torch.float64)
+    places = middle + torch.tensor([[0.0, 0.25, 0.0], [0.0, 0.0, 0.0], [0.3, 0.25, 0.1]])
+    shoulder = middle.clone().requires_grad_()
+    found = log_in_view(places, shoulder, middle)
+    found.sum().backward()
+    assert bool(found.isfinite().all()) and bool((found <= 0).all())
+    assert shoulder.grad is not None and bool(shoulder.grad.isfinite().all())
+
+
+def standing(n_frames):
+    """Return the keypoints of two bodies that stand still, [2, T, 8, 2]."""
+    left = torch.tensor([[100.0, 70.0], [80.0, 10.0], [50.0, -60.0]])
+    right = (left * torch.tensor([-1.0, 1.0])).flip(0)
+    spine = torch.tensor([[0.0, -140.0], [0.0, -80.0]])
+    return (300.0 + torch.cat([left, spine, right])).double().repeat(2, n_frames, 1, 1)
+
+
+def tracker_of(method, **options):
+    prior = torchpose.load_prior("kinect-upper-body-small")
+    return torchpose.UpperBodyTracker(prior, demo_camera(), method, **options)
+
+
+@pytest.mark.parametrize("method", ["articulated", "multiple-model"])
+def test_joints_on_one_pixel_are_tracked(method):
+    """All joints of one body, and both shoulders of the other."""
+    keypoints = standing(4)
+    keypoints[0] = 300.0
+    keypoints[1, :, UPPER_BODY.index("shoulder_left")] = keypoints[
+        1, :, UPPER_BODY.index("shoulder_right")
+    ]
+    track = tracker_of(method)(keypoints)
+    for name in ("joints2d", "joints3d", "covariance3d", "log_evidence", "bone_lengths"):
+        assert bool(getattr(track, name).isfinite().all()), name
+    assert track.failed_at.tolist() == [-1, -1]
+
+
+@pytest.mark.filterwarnings("ignore::torchpose.errors.DegenerateFilterWarning")
+@pytest.mark.parametrize("method", ["articulated", "multiple-model"])
+def test_a_body_that_is_lost_says_so_and_stays_alone(method):
+    tracker, keypoints = tracker_of(method, outliers=False), standing(6)
+    alone = tracker(keypoints[:1])
+    keypoints[1, 4, UPPER_BODY.index("shoulder_left")] = 1e160  # its square is infinite
+    track = tracker(keypoints)
+    assert track.failed_at.tolist() == [-1, 4]
+    finite = track.joints3d[1].flatten(1).isfinite()
+    assert bool(finite[:4].all()) and not bool(finite[4:].any())
+    torch.testing.assert_close(track.joints3d[0], alone.joints3d[0], rtol=0, atol=1e-12)
+
+
 def test_hands_before_the_chest_are_found_there():
     """Forearms that point at the camera look the same as ones that point away, through the chest."""
     truth = performance("merging hands", 120, 30.0, 0, 1.6)[0][::3].double()
     camera = demo_camera()
     seen = (truth @ camera.matrix.T)[..., :2] / truth[..., 2:]
-    tracker = torchpose.UpperBodyTracker(
-        torchpose.load_prior("kinect-upper-body-small"), camera, fps=10.0, method="articulated"
-    )
+    tracker = tracker_of("articulated", fps=10.0)
     found = tracker(seen[None], names=list(UPPER_BODY)).joints3d[0]
     neck, *hands = (UPPER_BODY.index(name) for name in ("neck", "hand_left", "hand_right"))
     off = (found - found[:, [neck]]) - (truth - truth[:, [neck]])

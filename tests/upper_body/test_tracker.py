@@ -29,9 +29,11 @@ from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
+from torchpose.upper_body._measured_joints import MeasuredJoints, place_measured_neck
 from torchpose.upper_body._single_poses import default_process_cov
 
 NAMES = list(KEYPOINT_NAMES)
+NECK_BY = ("shoulder_left", "shoulder_right")
 N_FRAMES = 120
 
 
@@ -114,6 +116,15 @@ def test_lengths_that_no_sequence_has_are_refused(prior, scene, lengths):
     batch = scene[1][None, :20].expand(2, -1, -1, -1)
     with pytest.raises(InputError, match="lengths must be integers from 1 to 20"):
         UpperBodyTracker(prior, demo_camera())(batch, names=NAMES, lengths=torch.tensor(lengths))
+
+
+def test_lengths_may_be_a_list(prior, scene):
+    batch = scene[1][None, :20].expand(2, -1, -1, -1)
+    tracker = UpperBodyTracker(prior, demo_camera(), "mkf-fixed")
+    found = tracker(batch, names=NAMES, lengths=[20, 12])
+    assert torch.equal(found.lengths, torch.tensor([20, 12]))
+    with pytest.raises(InputError, match="number of frames of each sequence, got 'all'"):
+        tracker(batch, names=NAMES, lengths="all")
 
 
 def test_names_may_come_in_any_order_and_subset(prior, scene, plain):
@@ -287,6 +298,7 @@ def test_files_of_older_releases_do_not_say_what_ran(prior, scene, tmp_path):
     ("options", "error", "message"),
     [
         ({"camera": None}, CameraError, "a camera is needed"),
+        ({"camera": "525,525,319.5,239.5"}, CameraError, "a PinholeCamera, got str"),
         ({"method": "mkf"}, InputError, "mkf-fixed"),
         ({"smoothing": "half"}, InputError, "smoothing"),
         ({"smoothing": -1}, InputError, "smoothing"),
@@ -332,6 +344,7 @@ def test_a_prior_of_another_kind_is_refused(prior):
     ("change", "error", "message"),
     [
         ({"keypoints": torch.zeros(10, 4, 2)}, ShapeError, "keypoints"),
+        ({"keypoints": np.zeros((1, 10, 4, 2))}, InputError, "got ndarray; convert it"),
         ({"keypoints": torch.zeros(1, 0, 4, 2)}, InputError, "at least one"),
         ({"keypoints": torch.full((1, 10, 4, 2), float("inf"))}, InputError, "finite"),
         (
@@ -399,7 +412,7 @@ def test_shoulders_stand_for_a_neck_that_is_not_there(prior, scene):
     eye, zeros = torch.eye(3).double(), torch.zeros(3).double()
     shoulders = project(truth, demo_camera().matrix, eye, zeros)[:, [2, 5], :2]
     wide = torch.cat([keypoints, shoulders], 1)[None]
-    names = [*NAMES, "shoulder_left", "shoulder_right"]
+    names = [*NAMES, *NECK_BY]
     keep = [i for i, name in enumerate(names) if name != "neck"]
     tracker = UpperBodyTracker(prior, demo_camera())
     track = tracker(wide[:, :, keep], names=[names[i] for i in keep])
@@ -408,6 +421,79 @@ def test_shoulders_stand_for_a_neck_that_is_not_there(prior, scene):
     own = UpperBodyTracker(prior, demo_camera(), neck="low-neck")(wide, names=names)
     torch.testing.assert_close(own.joints3d, track.joints3d)
     torch.testing.assert_close(tracker(wide, names=names).notes, ())
+
+
+def with_shoulders(scene, n_frames):
+    """Keypoints of head, hands and shoulders, without a neck, and their names."""
+    truth, keypoints = (x[:n_frames] for x in scene)
+    shoulders = demo_camera()(truth)[:, [2, 5], :2]
+    keep = [i for i, name in enumerate(NAMES) if name != "neck"]
+    names = [*(NAMES[i] for i in keep), *NECK_BY]
+    return torch.cat([keypoints[:, keep], shoulders], 1)[None], names
+
+
+@pytest.mark.parametrize("method", ["window-mixture", "mkf-fixed"])
+def test_a_neck_between_the_shoulders_is_as_sure_whoever_else_is_seen(prior, scene, method):
+    """Shoulders are less sure here than a neck, and R changes from frame to frame for one body alone."""
+    keypoints, names = with_shoulders(scene, 20)
+    std = [3.0, 3.0, 10.0, 3.0, 3.0]
+    tracker = UpperBodyTracker(prior, demo_camera(), method, measurement_std=std)
+    alone = tracker(keypoints, names=names)
+    confidence = torch.ones(2, 20, len(names))
+    confidence[1, 10, 0] = 0.5
+    both = tracker(keypoints.expand(2, -1, -1, -1), confidence, names)
+    torch.testing.assert_close(both.joints3d[0], alone.joints3d[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(both.covariance2d[0], alone.covariance2d[0], rtol=1e-6, atol=1e-6)
+
+
+def test_noise_that_stays_is_shared_where_all_necks_are_put_alike():
+    head, neck, left, right = (UPPER_BODY.index(n) for n in ("head", "neck", *NECK_BY))
+    cov = torch.arange(1.0, 9.0).double()[:, None, None] * torch.eye(2)
+    uv, mask = torch.zeros(1, 3, 8, 2).double(), torch.ones(1, 3, 8, dtype=torch.bool)
+    share, spread = KINECT_NECK.fraction, KINECT_NECK.spread * 200.0
+
+    def of_neck(known):
+        cov_of = place_measured_neck(MeasuredJoints(uv, known, cov), 200.0).cov
+        return cov_of[..., neck, :, :]
+
+    def expected(middle):
+        return (1 - share) ** 2 * middle + share**2 * cov[head] + spread**2 * torch.eye(2)
+
+    by_point, by_shoulders = expected(cov[neck]), expected((cov[left] + cov[right]) / 4)
+    without = mask.clone()
+    without[..., neck] = False
+    torch.testing.assert_close(of_neck(mask), by_point)
+    torch.testing.assert_close(of_neck(without), by_shoulders)
+    mixed = without.clone()
+    mixed[:, 1, neck] = True
+    torch.testing.assert_close(
+        of_neck(mixed)[0], torch.stack([by_shoulders, by_point, by_shoulders])
+    )
+    unknown = without.clone()
+    unknown[:, 1, left] = False
+    torch.testing.assert_close(of_neck(unknown), by_shoulders)
+
+
+@pytest.mark.parametrize("missing", ["confidence", "unknown confidence", "mask", "keypoint"])
+@pytest.mark.parametrize("value", [0.0, torch.nan])
+def test_the_covariance_of_what_is_not_measured_is_ignored(prior, scene, missing, value):
+    keypoints = torch.cat([scene[1][None, :5], torch.full((1, 5, 1, 2), 400.0)], 2)
+    names = [*NAMES, "hip_left"]
+    cov = 9.0 * torch.eye(2, dtype=torch.float64).repeat(1, 5, 5, 1, 1)
+    given = {"confidence": torch.ones(1, 5, 5)}
+    if missing == "mask":
+        given = {"mask": torch.ones(1, 5, 5, dtype=torch.bool)}
+        given["mask"][0, 2, 3] = False
+    elif missing == "keypoint":
+        keypoints[0, 2, 3] = torch.nan
+    else:
+        given["confidence"][0, 2, 3] = 0.0 if missing == "confidence" else torch.nan
+    tracker = UpperBodyTracker(prior, demo_camera(), "mkf-fixed")
+    expected = tracker(keypoints, names=names, covariance=cov, **given).joints3d
+    cov[0, 2, 3] = value
+    cov[:, :, 4] = value  # no joint of the eight
+    found = tracker(keypoints, names=names, covariance=cov, **given).joints3d
+    assert torch.equal(found, expected)
 
 
 def test_a_prior_without_noise_gets_a_default(prior):

@@ -90,10 +90,14 @@ def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: s
 
 def check_floating(name: str, tensor: Any) -> None:
     """Raise `InputError` unless `tensor` holds real floating-point numbers."""
-    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-        kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+    if not isinstance(tensor, Tensor):
         raise InputError(
-            f"{name} must be a floating-point tensor, got {kind}; convert it with .double()"
+            f"{name} must be a floating-point tensor, got {type(tensor).__name__}; convert it with "
+            "torch.as_tensor"
+        )
+    if not tensor.is_floating_point():
+        raise InputError(
+            f"{name} must be a floating-point tensor, got {tensor.dtype}; convert it with .double()"
         )
 
 

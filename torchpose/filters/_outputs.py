@@ -18,6 +18,7 @@ __all__ = [
     "collect",
     "effective_sample_size",
     "finish_output",
+    "first_not_finite",
     "mending",
     "stacked_mending",
 ]
@@ -152,7 +153,7 @@ def finish_output(
         inside = frames < lengths[:, None]
         log_evidence = torch.where(inside, log_evidence, torch.zeros_like(log_evidence))
         work = Mending(*(part * inside for part in work))
-    failed_at = _first_failure(mean)
+    failed_at = first_not_finite(mean)
     if not values_visible() or bool((failed_at >= 0).any()):
         lost = frames >= failed_at[:, None]
         lost = lost & (failed_at >= 0)[:, None]
@@ -162,8 +163,9 @@ def finish_output(
     return FilterOutput(mean, log_weights, log_evidence, cov, failed_at, *work)
 
 
-def _first_failure(mean: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
-    bad = ~torch.isfinite(mean).all(-1)
+def first_not_finite(values: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
+    """Return the first frame in which any value is NaN or infinite, -1 where none is."""
+    bad = ~torch.isfinite(values).all(-1)
     first = bad.int().argmax(1)
     return torch.where(bad.any(1), first, torch.full_like(first, -1))
 

@@ -252,12 +252,13 @@ class RecursiveFilter(WideModule, ABC):
         *,
         generator: Generators = None,
         return_cov: bool = False,
+        progress: bool = False,
     ) -> tuple[Any, FilterOutput]:
         """Filter some more frames online: the same numbers as `step` for one after the other.
 
         Args:
-            state: from `init`, `step` or `advance`. z, mask, measurement_cov, generator, return_cov: as
-                `forward`.
+            state: from `init`, `step` or `advance`. z, mask, measurement_cov, generator, return_cov,
+                progress: as `forward`.
 
         Returns:
             The next state and a `FilterOutput`, whose `failed_at` counts from the first of these frames.
@@ -269,7 +270,7 @@ class RecursiveFilter(WideModule, ABC):
         self.check_state(state, len(z))
         with one_run(self.observed.device):
             frames = self.check(z, mask, measurement_cov, None, generator)
-            return self.continue_frames(state, frames, generator, return_cov)
+            return self.continue_frames(state, frames, generator, return_cov, progress)
 
     @takes_former_arguments
     def forward(

@@ -29,6 +29,7 @@ __all__ = [
     "mixture_moments",
     "product",
     "safe_cholesky",
+    "safe_eigh",
     "spare_columns",
     "symmetrise",
 ]
@@ -53,6 +54,20 @@ def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
         Lower triangular L [..., D, D] with L L^T = matrix.
     """
     return mended_cholesky(matrix)[0]
+
+
+def safe_eigh(
+    matrix: Float[Tensor, "*batch D D"],
+) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D D"]]:
+    """Return eigenvalues and eigenvectors; NaN for a matrix that is not finite, which eigh would refuse.
+
+    Args:
+        matrix: [..., D, D], symmetric; only the lower triangle is read.
+    """
+    finite = torch.isfinite(matrix).all(-1, keepdim=True).all(-2, keepdim=True)
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    values, vectors = torch.linalg.eigh(torch.where(finite, matrix, eye))
+    return torch.where(finite[..., 0], values, math.nan), torch.where(finite, vectors, math.nan)
 
 
 def mended_cholesky(

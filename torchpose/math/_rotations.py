@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpose._core.arguments import as_pair
 from torchpose._core.checks import check_choice, check_shape
 from torchpose._core.module_state import outside_inference
+from torchpose.math._gaussian import safe_eigh
 
 __all__ = [
     "ROTATION_ORDERS",
@@ -345,7 +346,7 @@ def mean_rotation(
         weights: [..., N], not negative; equal ones by default.
 
     Returns:
-        Quaternion vector [..., 3] in the unit ball.
+        Quaternion vector [..., 3] in the unit ball; NaN where a rotation or a weight is.
 
     Raises:
         ShapeError: the last dimension is not 3.
@@ -355,7 +356,7 @@ def mean_rotation(
     check_shape("vectors", vectors, ["...", None, 3])
     quaternions = vector_to_quaternion(vectors)
     weighted = quaternions if weights is None else quaternions * weights[..., None]
-    _, axes = torch.linalg.eigh(weighted.mT @ quaternions)
+    _, axes = safe_eigh(weighted.mT @ quaternions)
     return quaternion_to_vector(axes[..., -1])
 
 

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError
-from torchpose.math._gaussian import condition, safe_cholesky, symmetrise
+from torchpose.math._gaussian import condition, safe_cholesky, safe_eigh, symmetrise
 
 __all__ = [
     "DIRECTIONS",
@@ -71,7 +71,7 @@ def sigma_points(
     if directions == "cholesky":
         axes = safe_cholesky(covariance)
     else:
-        values, vectors = _eigh(covariance)
+        values, vectors = safe_eigh(covariance)
         axes = vectors * values.clamp_min(0).sqrt()[..., None, :]
     steps = math.sqrt(dim + 0.5 * centre) * axes.mT  # row d: the step along direction d
     middle = mean[..., None, :]
@@ -188,16 +188,5 @@ def floor_eigenvalues(
     """
     if not 0 <= least < math.inf:
         raise InputError(f"least must be a variance, zero or more and finite, got {least}")
-    values, vectors = _eigh(covariance)
+    values, vectors = safe_eigh(covariance)
     return symmetrise((vectors * values.clamp_min(least)[..., None, :]) @ vectors.mT)
-
-
-def _eigh(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return eigenvalues and eigenvectors; NaN for a matrix that is not finite, which eigh would refuse."""
-    finite = torch.isfinite(covariance).all(-1, keepdim=True).all(-2, keepdim=True)
-    if bool(finite.all()):
-        values, vectors = torch.linalg.eigh(covariance)
-        return values, vectors
-    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    values, vectors = torch.linalg.eigh(torch.where(finite, covariance, eye))
-    return torch.where(finite[..., 0], values, math.nan), vectors

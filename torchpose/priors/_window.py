@@ -5,7 +5,7 @@ some frames earlier (or later), and of the other hand. A mixture over windows ca
 other arm into the estimate, which a mixture over single poses cannot.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -49,12 +49,16 @@ class WindowLayout:
         own: lags of the arm's own hand, frames; positive is the past. other: lags of the other hand.
         fps: the frame rate that the lags count at.
         torso: whether the joints of the arm in the axes of the torso follow (`torchpose.skeleton._torso`).
+        repeated: which of the hands, own before other, are not measured because their frame is that of a
+            nearer lag, or for the own hand the present one. At low rates several lags are one frame, which
+            counts once.
     """
 
     own: tuple[int, ...]
     other: tuple[int, ...]
     fps: float = 30.0
     torso: bool = False
+    repeated: tuple[int, ...] = ()
 
     @property
     def dim(self) -> int:
@@ -99,9 +103,27 @@ class WindowLayout:
     def at_rate(self, fps: float) -> "WindowLayout":
         """Return the lags in frames at another frame rate."""
         ratio = fps / self.fps
-        own = tuple(round(lag * ratio) for lag in self.own)
-        other = tuple(round(lag * ratio) for lag in self.other)
-        return WindowLayout(own, other, fps, self.torso)
+        exact = [[lag * ratio for lag in lags] for lags in (self.own, self.other)]
+        own, other = (tuple(round(lag) for lag in lags) for lags in exact)
+        of_own, of_other = _repeated(exact[0], {0}), _repeated(exact[1], set())
+        repeated = (*of_own, *(len(own) + i for i in of_other))
+        return WindowLayout(own, other, fps, self.torso, repeated)
+
+
+def _repeated(lags: Sequence[float], taken: set[int]) -> list[int]:
+    """Return which lags are rounded to a frame that is taken, or to which another one is nearer.
+
+    Of two that are as near the first is measured.
+    """
+    off = [round(abs(lag - round(lag)), 6) for lag in lags]
+    nearest_first = sorted(range(len(lags)), key=off.__getitem__)
+    repeated = []
+    for i in nearest_first:
+        frame = round(lags[i])
+        if frame in taken:
+            repeated.append(i)
+        taken = taken | {frame}
+    return sorted(repeated)
 
 
 class WindowPrior(nn.Module):
@@ -238,8 +260,8 @@ def window_measurements(
     """Return the measured pixels of the hands of each frame's window, relative to the body's present place.
 
     Poses of the prior are centred on the neck and seen from one place, so a hand of another frame is
-    carried along with the body (`BodyPath.carried`). A hand that was not measured, or that lies
-    beyond the ends of the sequence, is missing.
+    carried along with the body (`BodyPath.carried`). A hand that was not measured, that lies
+    beyond the ends of the sequence or that the window has already (`WindowLayout.repeated`) is missing.
 
     Args:
         uv, mask: the eight joints in the prior's pixels. layout: lags in frames of this sequence.
@@ -258,7 +280,9 @@ def window_measurements(
     inside = (frames >= 0) & (frames < n_frames)
     frames = frames.clamp(0, n_frames - 1)
     rows = _whole(tuple(joints), uv.device)
-    return path.carried(uv[:, frames, rows], lags), mask[:, frames, rows] & inside
+    once = [i not in layout.repeated for i in range(layout.n_hands)]
+    known = mask[:, frames, rows] & inside & _whole(tuple(once), uv.device).bool()
+    return path.carried(uv[:, frames, rows], lags), known
 
 
 @cache

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -129,8 +130,9 @@ class ArticulatedFilter(Estimator):
         model: the model of the tracker.
         arms: the prior over arms, or its file; by default the one that comes with the package.
         bone_lengths: the lengths that were measured on the person, metres: any of upper_arm, forearm (to
-            the measured hand or wrist), shoulder_width and head_height (above the neck). The others are
-            expected in proportion.
+            the measured hand or wrist), shoulder_width and head_height (above Kinect's neck, which is
+            10.5 cm above the middle of the shoulders, whatever neck is measured). The others are expected
+            in proportion.
         height: the height of the person, metres.
         person: poses of the same person, or the file that `PoseTrack.save` wrote, of which the last
             lengths are taken.
@@ -184,7 +186,12 @@ class ArticulatedFilter(Estimator):
             (like, self.prior.lengths, self.prior.spread),
             lambda: BodyLengths(self.prior, hand, neck, known, like),
         )
-        self.matrix = info.matrix.to(like)
+        self.matrix, self.inverse = derived(
+            owner,
+            ("matrix and inverse", info.fx, info.fy, info.cx, info.cy),
+            (like,),
+            lambda: (info.matrix.to(like), torch.linalg.inv(info.matrix.to(like))),
+        )
         self.root = RootStep(self.grid, self.chain, self.lengths)
 
     def init(
@@ -239,9 +246,8 @@ class ArticulatedFilter(Estimator):
         """Yield the result of each frame."""
         if self.middle_alone:
             measured = with_middle(measured)
-        frames = zip(
-            split(as_rays(measured, self.matrix)), facts_of(measured, self.matrix), strict=True
-        )
+        rays = split(as_rays(measured, self.matrix, self.inverse))
+        frames = zip(rays, facts_of(measured, self.matrix), strict=True)
         before, sizes = self.grid.moments(state.root), self.lengths.sizes(state.lengths)
         for frame, facts in tqdm([*frames], disable=not progress, desc="frames"):
             step = self._step(state, frame, facts, before, sizes)

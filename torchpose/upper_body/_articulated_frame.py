@@ -128,16 +128,18 @@ def upright(frame: RayFrame, facts: Facts, tilt: Float[Tensor, "B 3 3"]) -> Upri
     return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts, borders)
 
 
-def as_rays(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> RayFrame:
+def as_rays(
+    measured: MeasuredJoints, matrix: Float[Tensor, "3 3"], inverse: Float[Tensor, "3 3"]
+) -> RayFrame:
     """Return the measurements of T frames as rays, [B, T, ...].
 
     Args:
-        measured: the measurements, [B, T, ...]. matrix: K of the prior's camera.
+        measured: the measurements, [B, T, ...]. matrix: K of the prior's camera. inverse: K^-1.
     """
     focal = (matrix[0, 0] * matrix[1, 1]).sqrt()
     uv, known = measured.uv, measured.mask
     ones = torch.ones_like(uv[..., :1])
-    rays = torch.cat([uv, ones], -1) @ torch.linalg.inv(matrix).mT
+    rays = torch.cat([uv, ones], -1) @ inverse.mT
     variance = measured.cov.diagonal(dim1=-2, dim2=-1).mean(-1)
     std = (variance.sqrt() / focal).expand(known.shape)
     sure = measured.confidence

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpose._core.module_state import outside_inference
 from torchpose.camera._projection import project
-from torchpose.filters._outputs import FilterOutput
+from torchpose.filters._outputs import FilterOutput, first_not_finite
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import ArmChain, ArmState, mirrored
@@ -199,11 +199,11 @@ def estimates_of(
     covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
     uv = project(joints, matrix, back.mT, neck)[..., :2]
     uv_covs = _pixel_covs(stacked.joints, stacked.covs, matrix)
-    never = torch.full((len(neck),), -1, dtype=torch.long, device=neck.device)
+    failed_at = first_not_finite(joints.flatten(2))
     left, right = (
         FilterOutput(
             joints.flatten(2), stacked.log_weights[:, :, arm], stacked.log_evidence[:, :, arm], None,
-            never,
+            failed_at,
         )
         for arm in (0, 1)
     )  # fmt: skip

@@ -27,7 +27,8 @@ __all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths", "Sizes"]
 
 BODY_LENGTHS = ("upper_arm", "forearm", "shoulder_width", "head_height")
 """Lengths that may be given: shoulder to elbow, elbow to the measured hand or wrist, between the
-shoulders, and from the neck up to the head."""
+shoulders, and from Kinect's neck, 10.5 cm above the middle of the shoulders, up to the head, whatever neck
+is measured."""
 
 _NUDGE = 0.03  # step of the finite differences in log-length
 _MOST = 0.1  # of a log-length that one frame may change it by
@@ -171,7 +172,8 @@ class BodyLengths:
                 )
         rows = [BODY_LENGTHS.index(name) for name in given]
         values = self.usual.new_tensor(list(given.values()))
-        self._expect(rows, values, torch.full_like(values, _GIVEN))
+        lengths = values + self.lower[rows]
+        self._expect(rows, lengths, _GIVEN * (values / lengths))
 
     def _expect(self, rows: list[int], metres: Tensor, spread: Tensor) -> None:
         """Expect these lengths, and the others in proportion."""

@@ -98,6 +98,11 @@ def check_model(
             "a camera is needed, got None; pass camera=PinholeCamera(fx, fy, cx, cy), "
             "PinholeCamera.from_image_size(width, height), or prior.camera if it is the same"
         )
+    if not isinstance(camera, PinholeCamera):
+        raise CameraError(
+            f"camera must be a PinholeCamera, got {type(camera).__name__}; pass "
+            "PinholeCamera(fx, fy, cx, cy), or for a matrix PinholeCamera.from_matrix(K)"
+        )
     return camera
 
 

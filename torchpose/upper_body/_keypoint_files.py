@@ -48,7 +48,7 @@ class TrackSettings:
         arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
         bone_lengths: articulated: lengths measured on the person in metres, with commas: any of
             upper_arm=, forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above
-            the neck).
+            Kinect's neck, which is 10.5 cm above the middle of the shoulders).
         height: articulated: the height of the person in metres, if their bones were not measured.
         person: articulated: the .npz of an earlier recording of the same person, whose bone lengths are
             taken.

@@ -6,12 +6,20 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchpose.errors import InputError
 from torchpose.upper_body._fusion import MotionStageState
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._screen_tracks import ScreenState
 
-__all__ = ["LivePose", "StreamState", "live_pose", "unseen_frames"]
+__all__ = [
+    "LivePose",
+    "StreamState",
+    "check_stream",
+    "check_stream_method",
+    "live_pose",
+    "unseen_frames",
+]
 
 
 class StreamState(NamedTuple):
@@ -23,6 +31,7 @@ class StreamState(NamedTuple):
         unseen: the number of frames since any joint was measured, [B].
         n_keypoints: J. picked: the places of the eight joints among them, and the assumptions.
         screen: state of the outlier screening; None without any.
+        method: the name of the method whose state it is.
     """
 
     estimator: Any
@@ -31,6 +40,7 @@ class StreamState(NamedTuple):
     n_keypoints: int
     picked: Picked
     screen: ScreenState | None = None
+    method: str | None = None
 
 
 class LivePose(NamedTuple):
@@ -65,6 +75,24 @@ class LivePose(NamedTuple):
     inlier_probability: Tensor
     bone_lengths: Tensor
     bone_covariance: Tensor
+
+
+def check_stream(state: object) -> None:
+    """Refuse what is no state of a stream."""
+    if not isinstance(state, StreamState):
+        raise InputError(
+            f"state must be a StreamState, got {type(state).__name__}; begin with init, and pass on what "
+            "the step before returned"
+        )
+
+
+def check_stream_method(state: StreamState, method: str) -> None:
+    """Refuse the state of another method than that of the tracker."""
+    if state.method not in (None, method):
+        raise InputError(
+            f"state must be one of method {method!r}, as this tracker has it, got one of "
+            f"{state.method!r}; begin with init of this tracker"
+        )
 
 
 def live_pose(track: PoseTrack, unseen: Tensor) -> LivePose:

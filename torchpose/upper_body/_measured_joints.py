@@ -25,6 +25,7 @@ from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torc
 __all__ = [
     "MeasuredJoints",
     "arm_measurements",
+    "as_lengths",
     "block_diagonal",
     "check_gaps",
     "check_sequences",
@@ -33,6 +34,7 @@ __all__ = [
     "kept_pixel_maps",
     "known_covariances",
     "measure_joints",
+    "measured_keypoints",
     "pixel_indices",
     "pixels_per_metre",
     "place_measured_neck",
@@ -81,9 +83,15 @@ class MeasuredJoints(NamedTuple):
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
-    """Return the scale of the prior's camera at the neck of its mean pose."""
-    depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
-    return math.sqrt(prior.info.fx * prior.info.fy) / depth
+    """Return the scale of the prior's camera at the neck of its mean pose; computed once for each prior."""
+    info = prior.info
+
+    def make() -> float:
+        depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
+        return math.sqrt(info.fx * info.fy) / depth
+
+    sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple())
+    return derived(prior, ("pixels per metre", info.fx, info.fy), sources, make)
 
 
 def place_measured_neck(
@@ -93,9 +101,9 @@ def place_measured_neck(
 
     n = m + f (h - m),   R_n = (1 - f)^2 R_m + f^2 R_h + s^2 I
 
-    Where the head is missing, the neck is put upright above the middle, as high as Kinect's usually is;
-    where the middle is missing, so is the neck. Its errors go with those of the head, which the
-    filter does not know.
+    The middle of two measured shoulders has R_m = (R_l + R_r) / 4. Where the head is missing, the neck is
+    put upright above the middle, as high as Kinect's usually is; where the middle is missing, so is the
+    neck. Its errors go with those of the head, which the filter does not know.
 
     Args:
         measured: the joints, whose neck is a keypoint in the middle of the shoulders; where that is
@@ -120,46 +128,48 @@ def place_measured_neck(
         2, dtype=cov.dtype, device=cov.device
     )
     share = neck.fraction
-    of_middle = cov[..., _NECK, :, :]
-    if cov.ndim > 3:
-        of_shoulders = (cov[..., _LEFT, :, :] + cov[..., _RIGHT, :, :]) / 4
-        of_middle = torch.where(both[..., None, None], of_shoulders, of_middle)
-    with_head = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
-    if bool((known & ~head).any()):
-        alone = of_middle + spread * (_NECK_SPREAD / neck.spread) ** 2
+    headless, by_shoulders = (known & ~head).any(), both.any()
+    if bool(headless | (by_shoulders & (known & ~both).any())):
         cov = cov.expand(*uv.shape[:-2], *cov.shape[-3:]).clone()
-        with_head = torch.where(head[..., None, None], with_head, alone)
-    cov[..., _NECK, :, :] = with_head
+    of_shoulders = (cov[..., _LEFT, :, :] + cov[..., _RIGHT, :, :]) / 4
+    stands = both[..., None, None] if cov.ndim > 3 else by_shoulders
+    of_middle = torch.where(stands, of_shoulders, cov[..., _NECK, :, :])
+    of_neck = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
+    if bool(headless):
+        alone = of_middle + spread * (_NECK_SPREAD / neck.spread) ** 2
+        of_neck = torch.where(head[..., None, None], of_neck, alone)
+    cov[..., _NECK, :, :] = of_neck
     return measured._replace(uv=uv, mask=mask, cov=cov, middle=point)
 
 
 def known_covariances(
-    covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
+    covariance: Float[Tensor, "B T J 2 2"],
+    measured: Bool[Tensor, "B T J"],
+    indices: Sequence[int],
+    like: Tensor,
 ) -> Float[Tensor, "B T J 2 2"]:
-    """Return the covariances of the keypoints that are measured, and the identity for the others."""
-    check_shape("covariance", covariance, [*keypoints.shape, 2])
-    eye = torch.eye(2).to(keypoints)
-    there = keypoints.isfinite().all(-1)[..., None, None]
-    covariance = torch.where(there, covariance.to(keypoints), eye)
+    """Return the covariances of the joints that are measured, and the identity for all other keypoints.
+
+    Args:
+        covariance: of every keypoint. measured: which of them are there. indices: the places of the eight
+            joints among them, -1 if absent. like: a tensor of the dtype and on the device to work in.
+    """
+    check_shape("covariance", covariance, [*measured.shape, 2, 2])
+    wanted = torch.tensor([i in indices for i in range(measured.shape[2])], device=like.device)
+    used = (measured & wanted)[..., None, None]
+    covariance = torch.where(used, covariance.to(like), torch.eye(2).to(like))
     check_covariance("covariance", covariance)
     return covariance
 
 
-def measure_joints(
-    keypoints: Float[Tensor, "B T J 2"],
-    confidence: Tensor | None,
-    mask: Tensor | None,
-    indices: Sequence[int],
-    cov: Float[Tensor, "8 2 2"],
-    own_cov: Float[Tensor, "B T J 2 2"] | None = None,
-) -> MeasuredJoints:
-    """Return the eight joints among the keypoints, in the pixels of the keypoints.
+def measured_keypoints(
+    keypoints: Float[Tensor, "B T J 2"], confidence: Tensor | None, mask: Tensor | None
+) -> Bool[Tensor, "B T J"]:
+    """Return which keypoints are measured.
 
     Args:
         keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
-            missing, and between, R is divided by it. mask: [B, T, J], False = ignore, or None.
-        indices: the places of the eight joints among the keypoints, -1 if absent. cov: R at full
-            confidence. own_cov: R of every single keypoint instead.
+            missing. mask: [B, T, J], False = ignore, or None.
 
     Raises:
         InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
@@ -176,6 +186,25 @@ def measure_joints(
         confidence = confidence.to(measured.device)
         _check_confidence(confidence, measured)
         measured = measured & (confidence > 0)
+    return measured
+
+
+def measure_joints(
+    keypoints: Float[Tensor, "B T J 2"],
+    measured: Bool[Tensor, "B T J"],
+    confidence: Tensor | None,
+    indices: Sequence[int],
+    cov: Float[Tensor, "8 2 2"],
+    own_cov: Float[Tensor, "B T J 2 2"] | None = None,
+) -> MeasuredJoints:
+    """Return the eight joints among the keypoints, in the pixels of the keypoints.
+
+    Args:
+        keypoints: [B, T, J, 2]. measured: which of them are there (`measured_keypoints`).
+        confidence: [B, T, J], by which R is divided, or None.
+        indices: the places of the eight joints among the keypoints, -1 if absent. cov: R at full
+            confidence. own_cov: R of every single keypoint instead.
+    """
     picked = [max(i, 0) for i in indices]
     present = torch.tensor([i >= 0 for i in indices], device=measured.device)
     measured = measured[:, :, picked] & present
@@ -222,13 +251,15 @@ def in_prior_pixels(
         measurement_cov: R without `covariance`, in the prior's pixels.
 
     Raises:
-        ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
+        ShapeError, InputError: as `measured_keypoints`. CovarianceError: a covariance that is none.
     """
     to_prior, _ = kept_pixel_maps(camera, prior)
+    there = measured_keypoints(keypoints, confidence, mask)
     if covariance is not None:
-        covariance = to_prior.covariances(known_covariances(covariance, keypoints))
+        known = known_covariances(covariance, there, picked.indices, keypoints)
+        covariance = to_prior.covariances(known)
     measured = measure_joints(
-        keypoints, confidence, mask, picked.indices, measurement_cov, covariance
+        keypoints, there, confidence, picked.indices, measurement_cov, covariance
     )
     measured = measured._replace(uv=to_prior.points(measured.uv))
     if max(picked.face) >= 0:
@@ -264,6 +295,21 @@ def check_sequences(keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
             f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
         )
     return keypoints
+
+
+def as_lengths(lengths: Tensor | Sequence[int]) -> Tensor:
+    """Return the numbers of frames of sequences as a tensor; `check_gaps` looks at their values.
+
+    Raises:
+        InputError: what holds no numbers.
+    """
+    try:
+        return torch.as_tensor(lengths)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"lengths must hold the number of frames of each sequence, got {lengths!r}; pass a tensor or a "
+            "list of whole numbers"
+        ) from error
 
 
 def check_gaps(

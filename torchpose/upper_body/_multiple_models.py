@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.filters._outputs import first_not_finite
 from torchpose.math._rotations import (
     RotationOrder,
     euler_to_matrix,
@@ -218,10 +219,11 @@ class MultipleModelFilter(Estimator):
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
             mixed = mixed._replace(covs=trust[..., None, None, None] * mixed.covs)
         logs = torch.stack([share.log(), torch.log1p(-share)], -1)
-        arms = []
+        failed_at, arms = first_not_finite(mixed.joints.flatten(2)), []
         for ours, theirs in ((seen.left, bodies.left), (seen.right, bodies.right)):
             both = torch.stack([ours.log_evidence, theirs.log_evidence], -1)
-            arms.append(theirs._replace(log_evidence=torch.logsumexp(logs + both, -1)))
+            evidence = torch.logsumexp(logs + both, -1)
+            arms.append(theirs._replace(log_evidence=evidence, failed_at=failed_at))
         return Estimates(arms[0], arms[1], None, mixed, bodies.bones)
 
 

@@ -12,6 +12,7 @@ from torchpose.upper_body._face_points import FACE
 __all__ = ["Picked", "pick_joints"]
 
 _NECK = UPPER_BODY.index("neck")
+_WRISTS = "wrists are measured in place of hands: hand_left and hand_right are the wrists"
 _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")
 
 
@@ -40,6 +41,16 @@ class Picked(NamedTuple):
     def wrists_for_hands(self) -> bool:
         """Return whether wrists are measured in place of the prior's hands."""
         return self.hand == "wrist" and bool(self.of_hands)
+
+    def hand_notes(self, knows_wrists: bool) -> tuple[str, ...]:
+        """Return the notes about hands of another kind than the prior's.
+
+        Args:
+            knows_wrists: whether the estimator tells wrists from hands.
+        """
+        if not knows_wrists:
+            return self.of_hands
+        return (_WRISTS,) if self.wrists_for_hands else ()
 
     @property
     def middle_alone(self) -> bool:

@@ -271,14 +271,19 @@ def _screened(
 ) -> MeasuredJoints:
     """Return the measurements that are probable, of these joints; the same value if those are all."""
     uv, mask, cov = measured[:3]
+    sure = measured.confidence
     exchanged = bool((joints != torch.arange(8, device=mask.device)).any())
     if exchanged:
         mask = mask.gather(2, joints)
         uv = uv.gather(2, joints[..., None].expand_as(uv))
         if cov.ndim > 3:
             cov = cov.gather(2, joints[..., None, None].expand_as(cov))
+        if sure is not None:
+            sure = sure.gather(2, joints)
     kept = mask & (probability >= 0.5)
     if not exchanged and bool((kept == mask).all()):
         return measured
     uv = torch.where(kept[..., None], uv, torch.zeros_like(uv))
-    return measured._replace(uv=uv, mask=kept, cov=cov)
+    if sure is not None:
+        sure = torch.where(kept, sure, torch.ones_like(sure))
+    return measured._replace(uv=uv, mask=kept, cov=cov, confidence=sure)

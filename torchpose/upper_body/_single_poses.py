@@ -297,6 +297,7 @@ class SinglePoses(Estimator):
                     *arm_measurements(arm, joints, measured),
                     generator=state.generators[side],
                     return_cov=True,
+                    progress=progress,
                 )
             arms[side] = _wide(out)
         return state._replace(filters=filters), Estimates(arms["left"], arms["right"])
@@ -312,7 +313,7 @@ class SinglePoses(Estimator):
         """Return the estimates of whole sequences; see `Estimator`.
 
         `RecursiveFilter.forward` is `init` and `advance` of the filter, and knows which of its
-        covariances the sequences share.
+        covariances the sequences share. Smoothing takes all frames at once and shows no bar.
         """
         smoothing, arms = self.model.smoothing, {}
         for side, arm in ARMS.items():

@@ -12,6 +12,7 @@ _WIDE, _DEEP = 0.45, 0.25  # half the width and depth of a torso, in widths of t
 _TOP, _BOTTOM = 0.15, 1.5  # where it begins and ends, below the shoulders, in the same
 _SOFT, _SOFT_TOP, _SOFT_BOTTOM = 0.15, 0.05, 0.1  # of its surface, in half depths; of its ends
 _FACING = 0.2  # sine of the turn about which a front becomes a back
+_NARROWEST = 1e-3  # metres: measured shoulders may lie on one ray
 _HIDDEN = 0.1  # how often joints in a torso, or behind it, are measured, relative to those in view
 
 
@@ -36,6 +37,7 @@ def log_in_view(
         shoulder, middle: of the same arm, and the middle of both, in the same axes.
     """
     width = 2 * torch.linalg.vector_norm(shoulder - middle, dim=-1)[..., None]
+    width = width.clamp_min(_NARROWEST)
     x, down, z = ((ends - middle[..., None, :]) / width[..., None]).unbind(-1)
     x, z = x / _WIDE, z / _DEEP
     to_camera = -middle[..., None, 0] / _WIDE, -middle[..., None, 2] / _DEEP

@@ -36,9 +36,17 @@ from torchpose.upper_body._estimator_table import (
     options_of_window,
 )
 from torchpose.upper_body._fusion import kept_stage, stage_lag
-from torchpose.upper_body._live_pose import LivePose, StreamState, live_pose, unseen_frames
+from torchpose.upper_body._live_pose import (
+    LivePose,
+    StreamState,
+    check_stream,
+    check_stream_method,
+    live_pose,
+    unseen_frames,
+)
 from torchpose.upper_body._measured_joints import (
     MeasuredJoints,
+    as_lengths,
     check_gaps,
     check_sequences,
     in_prior_pixels,
@@ -228,7 +236,7 @@ class UpperBodyTracker(WideModule):
         names: Sequence[str] | None = None,
         mask: Bool[Tensor, "B T J"] | None = None,
         generator: Generators = None,
-        lengths: Int[Tensor, " B"] | None = None,
+        lengths: Int[Tensor, " B"] | Sequence[int] | None = None,
         progress: bool = False,
         covariance: Float[Tensor, "B T J 2 2"] | None = None,
         absent: Float[Tensor, "B T J"] | None = None,
@@ -246,7 +254,8 @@ class UpperBodyTracker(WideModule):
             generator: the generator of methods that draw, or a list of one for each sequence.
             lengths: [B], the number of frames of each sequence. progress: whether to show a bar.
             covariance: [B, T, J, 2, 2], the covariance of each keypoint in pixels squared, in place of
-                `measurement_std`; that of a missing keypoint is ignored. Frames with the same
+                `measurement_std`; that of a keypoint that is missing or none of the eight joints is
+                ignored. Frames with the same
                 covariances share work.
             absent: [B, T, J], the probability that a missing hand cannot be seen, because it is hidden or
                 outside of the image, as a detector has it at even odds; NaN where nothing is known. A hand
@@ -265,6 +274,7 @@ class UpperBodyTracker(WideModule):
         with one_run(self.measurement_cov.device):
             keypoints = check_sequences(keypoints).to(self.measurement_cov)
             picked = self._pick(keypoints.shape[2], names)
+            lengths = None if lengths is None else as_lengths(lengths)
             given = self._measure(keypoints, confidence, mask, covariance, absent, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             there = given.mask.flatten(0, 1).any(0).tolist()
@@ -311,11 +321,11 @@ class UpperBodyTracker(WideModule):
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
         with one_run(self.measurement_cov.device):
-            estimator = self._reader(picked.there, picked).estimator
+            reader = self._reader(picked.there, picked)
             joints, arms = arm_joints(picked.there), generators_of_arms(generator)
-            state = estimator.init(batch_size, joints, arms)
+            state = reader.estimator.init(batch_size, joints, arms)
         unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
-        return StreamState(state, None, unseen, n_keypoints, picked)
+        return StreamState(state, None, unseen, n_keypoints, picked, method=reader.method)
 
     def step(
         self,
@@ -342,8 +352,9 @@ class UpperBodyTracker(WideModule):
             The next state, and the `LivePose` of this frame.
 
         Raises:
-            ShapeError, InputError: wrong shapes, infinite values.
+            ShapeError, InputError: wrong shapes, infinite values, or a state of another method.
         """
+        check_stream(state)
         check_shape("keypoints", keypoints, [len(state.unseen), state.n_keypoints, 2])
         given = (None if x is None else x[:, None] for x in (confidence, mask, covariance, absent))
         state, track = self.advance(state, keypoints[:, None], *given)
@@ -370,9 +381,11 @@ class UpperBodyTracker(WideModule):
             The next state, and the poses of these frames.
 
         Raises:
-            ShapeError, InputError: wrong shapes, no frames, infinite values.
+            ShapeError, InputError: wrong shapes, no frames, infinite values, or a state of another
+            method.
         """
         refuse_export(*_NO_EXPORT)
+        check_stream(state)
         check_floating("keypoints", keypoints)
         check_shape("keypoints", keypoints, [len(state.unseen), "T", state.n_keypoints, 2])
         if keypoints.shape[1] == 0:
@@ -381,6 +394,7 @@ class UpperBodyTracker(WideModule):
             keypoints = keypoints.to(self.measurement_cov)
             given = self._measure(keypoints, confidence, mask, covariance, absent, state.picked)
             reader = self._reader(state.picked.there, state.picked)
+            check_stream_method(state, reader.method)
             screen, found = screen_joints(self._screen(state.picked), state.screen, given)
             own, estimates = reader.estimator.advance(state.estimator, found.measured)
             motion, track = reader.read(state.motion, estimates, found)
@@ -391,7 +405,7 @@ class UpperBodyTracker(WideModule):
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
         """Return the notes about the choice of the method and about the kinds of neck and hands."""
         chosen = self.notes if method == self.method else ()
-        return chosen + picked.notes + (() if estimator.knows_wrists else picked.of_hands)
+        return chosen + picked.notes + picked.hand_notes(estimator.knows_wrists)
 
     def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
         info = self.prior.info
