@@ -110,8 +110,8 @@ class UpperBodyTracker(WideModule):
         fps: the frame rate of the keypoints, by which the process noise is scaled; by default that of
             the prior.
         smoothing: the number of later frames that an estimate may use, "full" for all of them, None for
-            none; only for "articulated", "mkf-fixed" and "window-mixture", whose windows then look a few
-            frames ahead.
+            none; only for "multiple-model", "articulated", "window-mixture" and "mkf-fixed". Windows then
+            look a few frames ahead.
         frame: the axes of the 3D poses: "camera", or "body" for those of the prior's recordings.
         static_camera: whether the body is put in front of a camera that stays at the prior's mean place,
             turned by the estimated rotation, as the authors' released demo does.
