@@ -195,7 +195,9 @@ def test_rows_with_time_and_a_fourth_number(tmp_path):
     assert one.weights is not None and one.weights[3:, 7].tolist() == [0.5, 0]
     assert one.joints[4, 7].isnan().all()
     for fourth in (7.5, 0.0):
-        [one] = read_recording(write(tmp_path, "c.txt", rows_text(to_kinect(joints), fourth=fourth)))
+        [one] = read_recording(
+            write(tmp_path, "c.txt", rows_text(to_kinect(joints), fourth=fourth))
+        )
         assert one.weights is None and any("no tracking state" in note for note in one.notes)
 
 
