@@ -146,7 +146,8 @@ def collect_poses(
     extra: dict[str, Any] = {"head": head}
     if any(kind != wanted for kind in kinds):
         genuine = [j for j, kind in zip(joints, kinds, strict=True) if kind == wanted]
-        genuine = genuine or _with_neck(others, wanted, nose_as_head)
+        beside = [r.upper_body(nose_as_head) for r in others] if not genuine else []
+        genuine = genuine or [b.joints.to(torch.float64) for b in beside if b.neck == wanted]
         offset = learn_neck_offset(torch.cat(genuine) if genuine else joints[0][:0])
         joints = [
             j if kind == wanted else place_neck(j, offset)
@@ -174,14 +175,6 @@ def collect_poses(
         [float(r.fps or rate or DEFAULT_RATE) for r in recordings],
         [r.person_id for r in recordings],
     )
-
-
-def _with_neck(
-    recordings: Sequence[RecordingLike], kind: str, nose_as_head: bool
-) -> list[Float[Tensor, "T 8 3"]]:
-    """Return the joints of the recordings that have this kind of neck."""
-    bodies = (r.upper_body(nose_as_head) for r in recordings)
-    return [body.joints.to(torch.float64) for body in bodies if body.neck == kind]
 
 
 def short_paths(poses: PoseSet, room: float) -> PoseSet:
