@@ -21,6 +21,7 @@ from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation._person_recordings import (
+    KnownPersons,
     by_person,
     read_known_persons,
     renamed,
@@ -111,7 +112,7 @@ def run(
     if quick:
         persons = {name: group[::5] for name, group in persons.items()}
         counts, n_subsets, n_own = tuple(c for c in counts if c in counts[:2]), 2, min(1, n_own)
-    others = _others(further, len(persons) - 1, max(counts))
+    others, more_notes = _others(further, len(persons) - 1, max(counts))
     refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
     settings = fit_settings(
         "learning-curve", seed, quick, n_components, window_components, window_samples, 0
@@ -148,7 +149,7 @@ def run(
         report.findings.append(
             f"Not tested on a prior of their own, with one recording only: {', '.join(whole)}."
         )
-    report.findings += notes
+    report.findings += [*notes, *more_notes]
     title = "Persons never seen: error over the number of training persons"
     draw_picture(report, out, "learning-curve.png", lambda: plot_curves(curves, title))
     report.save(out)
@@ -224,19 +225,22 @@ def _doubling(most: int) -> tuple[int, ...]:
     return tuple(sorted({min(2**i, most) for i in range(most.bit_length() + 1)}))
 
 
-def _others(folders: Sequence[Path], most: int, count: int) -> dict[str, list[Recording]]:
-    """Return the missing number of further training persons."""
+def _others(
+    folders: Sequence[Path], most: int, count: int
+) -> tuple[dict[str, list[Recording]], list[str]]:
+    """Return the missing number of further training persons, and notes on their recordings."""
     missing = count - most
     if missing <= 0:
-        return {}
-    others = by_person(read_known_persons(folders).recordings) if folders else {}
+        return {}, []
+    recordings, notes = read_known_persons(folders) if folders else KnownPersons([], [])
+    others = by_person(recordings)
     if missing > len(others):
         raise InputError(
             f"{count} training persons are asked for, and there are {most} beside the one who is "
             f"tracked, and {len(others)} further ones; name recordings of others with --more, or "
             "smaller --counts"
         )
-    return dict(list(others.items())[:missing])
+    return dict(list(others.items())[:missing]), notes
 
 
 def _curve_job(
