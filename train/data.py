@@ -80,7 +80,7 @@ class RecordingsDataModule(LightningDataModule):
         self.tasks = self.recipe.tasks(self.train)
         self.sources = {Key(name): cached(task.source) for name, task in self.tasks.items()}
         if self.watched:
-            for name, task in self._watched_recipe().tasks(self.watched).items():
+            for name, task in self._watched_recipe().tasks(self.watched, self.train).items():
                 if name in self.tasks:
                     self.sources[Key(name, held_out=True)] = cached(task.source)
 
@@ -113,7 +113,7 @@ class RecordingsDataModule(LightningDataModule):
         """Return states over poses of each held-out person."""
         recipe, people = self._watched_recipe(), sorted({r.person_id for r in self.watched})
         each = ([r for r in self.watched if r.person_id == person] for person in people)
-        return [cached(recipe.tasks(recordings)["pose"].source) for recordings in each]
+        return [cached(recipe.tasks(own, self.train)["pose"].source) for own in each]
 
     def _watched_recipe(self) -> UpperBodyRecipe:
         """Return the recipe with fewer states, and with the kind of neck that is fitted to."""

@@ -360,7 +360,8 @@ class FineTuning(LightningModule):
 
     def _track(self, prior: UpperBodyPrior) -> dict[str, HeldOut]:
         """Track the held-out persons in each way, and return the errors in every process."""
-        poses = collect_poses(self._data.watched, prior.info.neck, prior.info.centre)
+        data, info = self._data, prior.info
+        poses = collect_poses(data.watched, info.neck, info.centre, others=data.train)
         persons, seed = self._own_persons(), self._given.seed
         parts = results_of_all(lambda: [track_held_out(prior, poses, {p}, seed) for p in persons])
         return HeldOut.join_modes([part for own in parts for part in own])

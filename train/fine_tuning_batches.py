@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpose.camera import ViewRange
 from torchpose.errors import InputError
 from torchpose.io import Recording
+from torchpose.learning._curation.joints import measured, runs
 from torchpose.learning._fine_tuning import (
     TunableKalman,
     TunableWindow,
@@ -31,6 +32,7 @@ __all__ = ["Batches", "SequenceBatches", "WindowBatches", "batches_of"]
 
 _HELD_OUT_VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
 _HELD_OUT_SEQUENCES, _HELD_OUT_WINDOWS = 32, 2048
+_LEAST_FRAMES = 10  # of a part of a recording between frames with missing joints
 
 
 class Batches(Protocol):
@@ -85,7 +87,7 @@ class SequenceBatches:
         self._prior, self._size, self._seed = prior, share_size, seed
         self._train = _complete(prior, train)
         self._watched = {
-            person: _complete(prior, [r for r in watched if r.person_id == person])
+            person: _complete(prior, [r for r in watched if r.person_id == person], train)
             for person in sorted({r.person_id for r in watched})
         }
 
@@ -134,7 +136,7 @@ class WindowBatches:
         self._train = _window_sources(recipe, train)
         self._watched = {
             person: draw_windows(
-                _window_sources(still, [r for r in watched if r.person_id == person]), 0
+                _window_sources(still, [r for r in watched if r.person_id == person], train), 0
             )
             for person in sorted({r.person_id for r in watched})
         }
@@ -159,23 +161,36 @@ def _generator(seed: int, what: str) -> torch.Generator:
     return torch.Generator().manual_seed(derived_seed(seed, what))
 
 
-def _complete(prior: UpperBodyPrior, recordings: Sequence[Recording]) -> list[Tensor]:
-    """Return the sequences without missing joints."""
-    poses = collect_poses(recordings, prior.info.neck, prior.info.centre)
-    found = [s for s in poses.joints.split(poses.lengths) if bool(s.isfinite().all())]
+def _complete(
+    prior: UpperBodyPrior, recordings: Sequence[Recording], others: Sequence[Recording] = ()
+) -> list[Tensor]:
+    """Return the sequences, cut where a joint is missing.
+
+    Args:
+        prior: whose kind of neck they get. recordings: to cut. others: that tell where this neck is.
+
+    Raises:
+        InputError: nothing is left.
+    """
+    poses = collect_poses(recordings, prior.info.neck, prior.info.centre, others=others)
+    found = [
+        sequence[frames]
+        for sequence in poses.joints.split(poses.lengths)
+        for frames in runs(measured(sequence).all(1), min(_LEAST_FRAMES, len(sequence)))
+    ]
     if not found:
         raise InputError(
-            f"fine-tuning needs recordings without missing joints, got none of "
+            f"fine-tuning needs {_LEAST_FRAMES} frames in a row without a missing joint, got none of "
             f"{', '.join(sorted(set(poses.persons)))}"
         )
     return found
 
 
 def _window_sources(
-    recipe: UpperBodyRecipe, recordings: Sequence[Recording]
+    recipe: UpperBodyRecipe, recordings: Sequence[Recording], others: Sequence[Recording] = ()
 ) -> dict[str, WindowSource]:
     """Return windows of both arms, from other viewpoints whenever they are drawn."""
-    tasks = recipe.tasks(recordings)
+    tasks = recipe.tasks(recordings, others)
     sources = {}
     for side in ("left", "right"):
         if f"causal.{side}" not in tasks:

@@ -14,6 +14,7 @@ __all__ = ["KeypointRecording", "content_of", "find_keypoints", "share"]
 
 _SUFFIXES = (".npz", ".csv")
 _POINTS = ("keypoints.npy", "joints2d.npy")
+_RESULTS = ({"joints3d.npy", "covariance3d.npy"}, {"state.npy", "body_frame.npy"})
 _OPENPOSE = "*_keypoints.json"
 
 
@@ -30,9 +31,9 @@ def find_keypoints(
 ) -> list[KeypointRecording]:
     """Find recordings of keypoints among files and folders, the longest first.
 
-    Folders are searched with their subfolders; files of other content are passed over there, but
-    those that cannot be opened are listed, so that reading them says what is wrong. A folder of
-    OpenPose's JSON files is one recording.
+    Folders are searched with their subfolders; files of other content, and poses that were tracked
+    before, are passed over there, but those that cannot be opened are listed, so that reading them says
+    what is wrong. A folder of OpenPose's JSON files is one recording.
 
     Args:
         paths: files and folders. leave_out: a folder that is not searched: that of the results.
@@ -116,7 +117,9 @@ def _may_hold_keypoints(path: Path) -> bool:
     try:
         if suffix == ".npz":
             with zipfile.ZipFile(path) as archive:
-                return any(member in _POINTS for member in archive.namelist())
+                members = set(archive.namelist())
+            tracked = any(result <= members for result in _RESULTS)
+            return not tracked and bool(members.intersection(_POINTS))
         with path.open("rb") as stream:
             lines = stream.read(4096).decode("utf-8-sig", "replace").splitlines()
     except (zipfile.BadZipFile, OSError):

@@ -92,6 +92,11 @@ def test_noise_is_learnt_anew_for_a_prior_that_is_there(torchpose, files, tmp_pa
     )
     assert "--noise-of" in new.info.extra["noise"]["command"]
     assert "--noise-of" in out.with_suffix(".md").read_text()
+    assert (new.info.name, new.info.licence) == (made.info.name, made.info.licence)
+    done = torchpose(*line, "--folds", 0, "--name", "renewed", "--licence", "CC0")
+    assert done.code == 0, done.err
+    info = load_prior(out).info
+    assert (info.name, info.licence) == ("renewed", "CC0")
     stranger = torchpose(*line, "--without", "recordings#p1")
     assert stranger.code != 0 and "recordings#p2" in stranger.err
 
@@ -155,6 +160,14 @@ BAD_INPUT = {
     "upside down": (["{files}/recordings", "--axes", "y-up"], "upside|axes are others"),
     "other noise": (["{files}/recordings", "--noise", "some"], "learnt, none"),
     "other neck": (["{files}/recordings", "--neck", "long"], "mid-shoulder"),
+    "no new mixtures": (
+        ["{files}/recordings", "--noise-of", "kinect-upper-body", "--seed", "3"],
+        "--seed is for new mixtures, and --noise-of keeps those of a prior; leave it out",
+    ),
+    "no calibration": (
+        ["{files}/recordings", "--noise", "none", "--folds", "3"],
+        "--folds is for the calibration, and --noise none does without; leave it out",
+    ),
     "no components": (["{files}/recordings", "--components", "0"], "at least 1"),
     "no samples": (["{files}/recordings", "--samples", "0"], "at least 1"),
     "suffix": (["{files}/recordings", "--out", "{tmp}/p.npz"], "ends in .safetensors"),

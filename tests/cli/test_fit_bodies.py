@@ -167,13 +167,22 @@ def test_a_fit_that_was_killed_goes_on_to_the_same_result(torchpose, walks, tmp_
             raise KeyboardInterrupt
         return step(fit)
 
+    def die_writing(*_, **__):
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
         patch.setattr(GPLVMFit, "step", die)
         assert torchpose(*line, again).code == 130
     kept = tmp_path / "again.safetensors.partial"
     assert kept.is_file() and not again.exists()
+    done = torchpose(*line, again, "--latent-dim", 1)
+    assert done.code == 2 and "with other settings, that was interrupted" in done.err
+    with monkeypatch.context() as patch:
+        patch.setattr("torchpose.learning._fit_files.write_manifold_files", die_writing)
+        assert torchpose(*line, again, "--steps", 3).code == 130  # after one more step
+    assert kept.is_file() and not again.exists()  # until the manifold is written
     done = torchpose(*line, again)
-    assert done.code == 0 and "going on after 2 steps" in done.out and not kept.exists()
+    assert done.code == 0 and "going on after 3 steps" in done.out and not kept.exists()
     one, two = (tensors_and_facts("manifold", p) for p in (whole, again))
     assert one[1] == two[1]
     assert all(torch.equal(value, two[0][name]) for name, value in one[0].items())

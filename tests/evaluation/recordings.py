@@ -16,10 +16,12 @@ def poses(n_frames, seed):
     return performer(start + n_frames, fps=30.0, seed=seed).body[start:].double()
 
 
-def write_people(folder, persons=tuple(f"s{i}" for i in range(1, 9)), n_frames=30, n_sequences=1):
-    """Kinect v1 recordings of some persons, in Kinect axes."""
+def write_people(
+    folder, persons=tuple(f"s{i}" for i in range(1, 9)), n_frames=30, n_sequences=1, first=0
+):
+    """Kinect v1 recordings of some persons, in Kinect axes; the first one is this one of all persons."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number, person in enumerate(persons):
+    for number, person in enumerate(persons, first):
         for trial in range(n_sequences):
             body = poses(n_frames, 2 * number + trial).numpy()
             named = dict(zip(UPPER_BODY, np.moveaxis(body, 1, 0), strict=True))
@@ -48,11 +50,11 @@ def _v1_joint(name, named, neck):
     return neck + np.array([0.1 * sign, depth, 0.0])
 
 
-def write_one(folder, n_frames=60):
+def write_one(folder, n_frames=60, seed=1):
     """A recording of the eight joints, in camera axes."""
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(
-        folder / "kinect_joints.npz", joints=poses(n_frames, 1).numpy().astype(np.float32),
+        folder / "kinect_joints.npz", joints=poses(n_frames, seed).numpy().astype(np.float32),
         names=np.array(UPPER_BODY), fps=30.0, subject="one", source="example/one",
     )  # fmt: skip
     return folder

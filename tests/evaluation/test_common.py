@@ -1,6 +1,7 @@
 """Test sequences, scores, and priors kept between runs."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -157,11 +158,15 @@ def test_a_prior_is_fitted_once(data, tmp_path):
     assert again.noise.keys() == first.noise.keys()
     cached_prior(tmp_path, train[:2], recipe, False, seed=1)
     cached_prior(tmp_path, train[1:3], recipe, False, seed=0)
-    assert len(calls) == 3
+    cached_prior(tmp_path, [replace(r, fps=15.0) for r in train[:2]], recipe, False, seed=0)
+    half = torch.full((len(train[0]), len(train[0].names)), 0.5, dtype=torch.float64)
+    weighed = [replace(train[0], weights=half), train[1]]
+    cached_prior(tmp_path, weighed, recipe, False, seed=0)
+    assert len(calls) == 5
     for path in tmp_path.glob("prior-*.safetensors"):
         path.write_bytes(path.read_bytes()[:100])
     cached_prior(tmp_path, train[:2], recipe, False, seed=0)
-    assert len(calls) == 4
+    assert len(calls) == 6
 
 
 def test_tracking_in_chunks_changes_nothing(prior):

@@ -14,7 +14,7 @@ from benchmarks import uncommon_poses
 from tests.data import few_recordings
 from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
 from torchpose.cli import _evaluate as evaluate
-from torchpose.errors import InputError, OutputError
+from torchpose.errors import InputError, OutputError, OverlapError
 from torchpose.evaluation import _cross_dataset as cross_dataset
 from torchpose.evaluation import _learning_curve as learning_curve
 from torchpose.evaluation import _leave_one_person_out as leave_one_person_out
@@ -24,7 +24,7 @@ from torchpose.evaluation._learning_curve import cyclic_subsets, halves
 from torchpose.evaluation._person_recordings import POSE_CLASSES
 from torchpose.evaluation._person_tables import mean_error
 from torchpose.io import read_recordings
-from torchpose.skeleton import SKELETONS
+from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 MHAD = SKELETONS["mhad-16"].joints
 
@@ -40,7 +40,7 @@ def write_mocap(folder, persons, n_frames=40):
     """MHAD's joints: y up, wrists, a low neck and no head."""
     folder.mkdir(parents=True)
     for number, person in enumerate(persons):
-        (people,) = [write_people(folder / "v1" / person, (person,), n_frames)]
+        (people,) = [write_people(folder / "v1" / person, (person,), n_frames, first=4 + number)]
         with np.load(next(people.glob("*.npz"))) as arrays:
             named = dict(zip(V1, np.moveaxis(arrays["joints"], 1, 0), strict=True))
         middle = (named["left_shoulder"] + named["right_shoulder"]) / 2
@@ -56,13 +56,34 @@ def write_mocap(folder, persons, n_frames=40):
     return folder
 
 
+def write_table(path, body, stranger=()):
+    """A table of the eight joints, with another person beside the one whose file it is."""
+    path.parent.mkdir(parents=True)
+    columns = [f"{name}_{axis}" for name in UPPER_BODY for axis in "xyz"]
+    rows = ["# axes = camera", "# fps = 30", ",".join(["frame", "body_id", *columns])]
+    for number, bodies in enumerate((body, stranger)):
+        rows += [
+            ",".join(map(str, [frame, number, *joints.flatten().tolist()]))
+            for frame, joints in enumerate(bodies)
+        ]
+    path.write_text("\n".join(rows))
+
+
+def made_up_scores(jobs, *_):
+    """Scores of jobs, none of which is run: three frames of every person."""
+    values = torch.full((3, 8), 0.05)
+    score = unseen.Scored(values, values, values[:, None].expand(3, 2, 8) > 1, values[:, 0],
+                          values[:, :2].long())  # fmt: skip
+    return [dict.fromkeys(job.tests, score) for job in jobs]
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """UTD, burke and MHAD in small."""
     folder = tmp_path_factory.mktemp("data")
     names = ("s1", "s2", "s7", "s8")
     write_people(folder / "kinect_utd_mhad", names, n_frames=40, n_sequences=2)
-    write_one(folder / "burke_kinect", 40)
+    write_one(folder / "burke_kinect", 40, seed=14)
     write_mocap(folder / "mocap_berkeley_mhad", ("s1", "s9", "s10"))
     return folder
 
@@ -110,6 +131,49 @@ def test_a_killed_run_goes_on(left_out, data):
     )  # fmt: skip
     assert sorted(out.glob("*-*.*")) == kept
     assert again["persons"].rows == report["persons"].rows
+
+
+def test_only_persons_whom_files_name_are_scored(tmp_path, monkeypatch):
+    """Strangers in their files are neither trained on nor tested, and nobody is known by two names."""
+    ran = []
+    monkeypatch.setattr(
+        leave_one_person_out, "run_jobs", lambda jobs, *_: ran.extend(jobs) or made_up_scores(jobs)
+    )
+    write_table(tmp_path / "alice" / "both.csv", poses(30, 0), stranger=poses(12, 2))
+    write_table(tmp_path / "bob" / "own.csv", poses(30, 4))
+    report = leave_one_person_out.run(tmp_path, tmp_path / "out", progress=False)
+    tests = {job.label: [len(r) for r in job.tests[job.label]] for job in ran}
+    assert tests == {"alice": [30], "bob": [30]}
+    assert [[r.person_id for r in job.train] for job in ran] == [["bob#"], ["alice#"]]
+    assert report.findings[-1].startswith("Other people in both.csv are left out (1 recordings)")
+    people = read_recordings(tmp_path / "bob")[0]
+    one, other = (replace(people, person="s1", source=source) for source in "ab")
+    assert list(persons_module.by_person([one, other])) == ["a#s1", "b#s1"]
+
+
+def test_copies_under_two_persons_are_refused(data, tmp_path):
+    """Else what is tested is in the training."""
+    home = shutil.copytree(data / "kinect_utd_mhad", tmp_path / "home")
+    with np.load(home / "s1_a01_t0.npz") as arrays:
+        np.savez(home / "s2_copy.npz", **dict(arrays) | {"subject": "s2"})
+    more = write_people(tmp_path / "more", ("z",), first=9)
+    for protocol, folders in (
+        (leave_one_person_out, home), (learning_curve, home), (cross_dataset, [more, home]),
+    ):  # fmt: skip
+        with pytest.raises(OverlapError, match="under two persons would leak"):
+            protocol.run(folders, tmp_path / "out", progress=False)
+    with pytest.raises(OverlapError, match="under two persons would leak"):
+        learning_curve.run(
+            data / "kinect_utd_mhad", tmp_path / "out", progress=False, counts=(4,),
+            more=(str(write_people(tmp_path / "copied", ("y",), 40)),),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("protocol", [leave_one_person_out, learning_curve, cross_dataset])
+def test_counts_are_checked_before_any_work(protocol, tmp_path):
+    for setting in ("every", "workers"):
+        with pytest.raises(InputError, match=f"{setting} must be at least 1, got 0"):
+            protocol.run(tmp_path / "nothing", tmp_path, progress=False, **{setting: 0})
 
 
 def test_leaving_out_needs_two_persons(data, tmp_path):
@@ -167,10 +231,24 @@ def test_learning_curve(data, tmp_path):
     assert (tmp_path / "learning-curve.png").stat().st_size > 1000
 
 
+def test_persons_with_one_recording_have_no_prior_of_their_own(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(learning_curve, "run_jobs", made_up_scores)
+    home = shutil.copytree(data / "kinect_utd_mhad", tmp_path / "home")
+    for name in ("s1", "s7"):
+        (home / f"{name}_a01_t1.npz").unlink()
+    report = learning_curve.run(
+        home, tmp_path / "out", progress=False, counts=(1,), n_subsets=1, recipes=[("r", recipe)]
+    )
+    own = report["own"]
+    assert own["the person's first half, on the person", "tests"] == 2  # s2, s8
+    assert own["the person's first half, on others", "tests"] == 2
+    assert any("with one recording only: s1, s7." in line for line in report.findings)
+
+
 def test_learning_curve_of_any_recordings(data, tmp_path):
     """Folders of other names, with counts that go with the persons, and persons of a third folder."""
     one = write_people(tmp_path / "mine" / "a", ("ann", "bob"), n_frames=40)
-    two = write_people(tmp_path / "mine" / "b", ("carl",), n_frames=40)
+    two = write_people(tmp_path / "mine" / "b", ("carl",), n_frames=40, first=2)
     report = learning_curve.run(
         [one, two], tmp_path / "out", progress=False, n_own=0, n_subsets=1, recipes=[("r", recipe)]
     )
@@ -237,12 +315,14 @@ def test_across_data_sets(data, tmp_path):
 def test_across_any_data_sets(data, tmp_path):
     """Three folders of other names: nothing has to be made up where all have the same joints."""
     folders = [
-        write_people(tmp_path / name, persons, n_frames=110)
-        for name, persons in (("x", ("a", "b")), ("y", ("c", "d")), ("z", ("e", "f")))
+        write_people(tmp_path / name, persons, n_frames=110, first=first)
+        for first, name, persons in ((0, "x", "ab"), (4, "y", "cd"), (8, "z", "ef"))
     ]
     report = cross_dataset.run(
         folders, tmp_path / "out", progress=False, recipe=recipe, tested=("c",)
     )
+    with pytest.raises(InputError, match="there is no cc; the persons are a, b, c, d, e, f"):
+        cross_dataset.run(folders, tmp_path / "out", progress=False, tested=("c", "cc"))
     cross = report["cross"]
     assert {f"{a} → {b} ({p})" for a in "xyz" for b, p in zip("xyz", "bcf", strict=True)} < {
         *cross.rows
@@ -258,8 +338,8 @@ def test_across_any_data_sets(data, tmp_path):
 
 def test_motion_capture_added_to_any_data_sets(data, tmp_path):
     folders = [
-        write_people(tmp_path / name, persons, n_frames=60)
-        for name, persons in (("x", ("a", "b")), ("y", ("c", "d")))
+        write_people(tmp_path / name, persons, n_frames=60, first=first)
+        for first, name, persons in ((0, "x", "ab"), (2, "y", "cd"))
     ]
     mocap = str(data / "mocap_berkeley_mhad")
     report = cross_dataset.run(
@@ -279,7 +359,7 @@ def test_motion_capture_added_to_any_data_sets(data, tmp_path):
 
 
 def test_no_head_of_a_tested_person_is_learnt_from(data):
-    split = cross_dataset._crossed([data], (), 1)
+    split = cross_dataset._crossed(cross_dataset._read([data], (), "cross"), (), 1)
     sets = cross_dataset._alike(split, 0)
     tested = {r.person_id for group in split["UTD"].tested.values() for r in group}
     assert sets.completion.persons and not set(sets.completion.persons) & tested

@@ -45,7 +45,7 @@ def test_persons_are_told_apart_and_in_order(persons, tmp_path):
     for name in ("a", "b"):
         write_people(tmp_path / name, ("s1",))
     recordings = [replace(r, source="") for n in ("a", "b") for r in read_recordings(tmp_path / n)]
-    assert list(persons_module.by_person(recordings)) == ["a s1", "b s1"]
+    assert list(persons_module.by_person(recordings)) == ["a#s1", "b#s1"]
 
 
 def test_scores_are_those_of_tracker_and_metrics(persons, prior):

@@ -194,8 +194,11 @@ def test_rows_with_time_and_a_fourth_number(tmp_path):
     [one] = read_recording(write(tmp_path, "b.txt", rows_text(to_kinect(joints), fourth=states)))
     assert one.weights is not None and one.weights[3:, 7].tolist() == [0.5, 0]
     assert one.joints[4, 7].isnan().all()
-    [one] = read_recording(write(tmp_path, "c.txt", rows_text(to_kinect(joints), fourth=7.5)))
-    assert one.weights is None and any("no tracking state" in note for note in one.notes)
+    for fourth in (7.5, 0.0):
+        [one] = read_recording(
+            write(tmp_path, "c.txt", rows_text(to_kinect(joints), fourth=fourth))
+        )
+        assert one.weights is None and any("no tracking state" in note for note in one.notes)
 
 
 def test_daily_activity(tmp_path):
@@ -238,12 +241,13 @@ def test_what_are_no_rows(tmp_path, text, word):
 def test_a_table_with_a_header(tmp_path):
     joints = to_kinect(person(V2, 5))
     states = np.full((5, 25), 2.0)
-    states[2, 7] = 1
+    states[2, 7], states[3, 7] = 1, 0
     joints[1, 3] = np.nan
     extra = {"timestamp": [t / 20 for t in range(5)], "lean": [0] * 5}
     facts = ("person = eve", "action = wave")
     text = header_text(joints, V2, extra, ("state", states), facts)
     [one] = read_recording(write(tmp_path, "table.csv", text))
+    joints[3, 7] = np.nan  # not tracked, whatever stands there
     np.testing.assert_allclose(to_kinect(one.joints.numpy()), joints, atol=1e-6)
     assert one.fps == pytest.approx(20)
     assert (one.skeleton, one.person, one.action) == ("kinect-v2-25", "eve", "wave")

@@ -72,6 +72,13 @@ def test_optional_keys(tmp_path):
     [weighted] = read_recording(write(tmp_path / "b.npz", weights=np.full((4, 8), 0.5)))
     assert weighted.weights is not None
     assert weighted.weights.shape == (4, 8)
+    weights = np.ones((4, 8))
+    weights[2, 5] = 0
+    [untracked] = read_recording(write(tmp_path / "c.npz", weights=weights))
+    missing = untracked.joints.isnan().all(-1)
+    assert missing.nonzero().tolist() == [[2, 5]] and untracked.weights.tolist() == weights.tolist()
+    with pytest.raises(InputError, match="every joint has weight 0 or is missing"):
+        read_recording(write(tmp_path / "d.npz", weights=np.zeros((4, 8))))
 
 
 def test_axes_of_file_argument_and_joint_set(tmp_path):

@@ -1,23 +1,28 @@
 """What is fitted to recorded bodies: processes come back, sides are alike, sets count alike."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.body.test_articulation import zero_point
+from tests.priors.poses import recording
 from torchpose.body import fit_body, fit_state
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.errors import InputError
 from torchpose.learning._body_motion_fit import (
     BodyMotionRecipe,
     MotionSequence,
+    _draw_poses,
     acceleration_ratio,
     fit_body_motion,
     mirror_of,
     motion_sequence,
     pose_log_density,
 )
+from torchpose.learning._recipes.body_motion import _set_of
 from torchpose.math._rotations import matrix_to_quaternion_vector
 
 QUICK = BodyMotionRecipe(n_components=4, n_samples=400, acceleration_scale=1.0)
@@ -149,6 +154,40 @@ def test_a_set_says_nothing_of_joints_that_it_lacks(articulation):
     assert float(scale) == pytest.approx(0, abs=1e-9)
     with pytest.raises(InputError, match="no recording has the joint head, left_wrist; add"):
         fit_body_motion([without(whole, articulation, "head", "left_wrist")], QUICK)
+
+
+def test_a_part_of_which_no_set_has_all_joints_is_refused(articulation):
+    sides = ("left_hip", "right_hip")
+    halves = [
+        without(walk(articulation, seed=i, person=f"{i}#1"), articulation, side)
+        for i, side in enumerate(sides)
+    ]
+    with pytest.raises(InputError, match=r"no set of recordings has all of the joints .*left_hip"):
+        fit_body_motion(halves, QUICK)
+
+
+def test_folders_of_persons_are_no_sets():
+    """Who states no source is of a joint set, whatever the folder."""
+    stated = recording(person="a")
+    silent = [replace(stated, source="", path=Path(f"/home/{name}/x.npz")) for name in "ab"]
+    assert _set_of(stated) == "site:set"
+    assert len({_set_of(one) for one in silent}) == 1
+    assert {_set_of(replace(one, skeleton="mhad-16")) for one in silent} == {"mhad-16"}
+
+
+def test_angles_that_no_set_tells_together_are_drawn_from_those_that_tell_them(articulation):
+    """Two sets that each lack a joint: their angles are those of the other one, and never zero."""
+    headless = without(walk(articulation, seed=1, person="a#1"), articulation, "head")
+    footless = without(walk(articulation, seed=2, person="b#1"), articulation, "left_ankle")
+    sets = {"a": [headless], "b": [footless]}
+    drawn = _draw_poses(articulation, sets, 400, torch.Generator().manual_seed(0))
+    own = {name: articulation.relative_angles(one.point) for name, (one,) in sets.items()}
+    parts = articulation.axis_part[articulation.n_root :]
+    shank = int(articulation.part_of[articulation.skeleton.joint("left_ankle")])
+    for part, owner in ((articulation.skeleton.part("head"), "b"), (shank, "a")):
+        angles = drawn[:, parts == part]
+        assert bool(torch.isin(angles, own[owner][:, parts == part]).all())
+        assert float(angles.std(0).min()) > 0.01
 
 
 def test_poses_and_motion_are_alike_on_both_sides(articulation):

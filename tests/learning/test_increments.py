@@ -107,3 +107,10 @@ def test_mirrored_arms_pool_both_and_are_mirror_images():
     sign = torch.ones(21, dtype=torch.float64)
     sign[[0, 3, 6, 9, 12, 15, 17, 18]] = -1
     torch.testing.assert_close(found["right"], found["left"] * sign * sign[:, None])
+    for other in (HAND, UPPER_BODY.index("hand_right")):  # a hand that was never recorded
+        recordings = pairs(steps(200, cov, [HAND, UPPER_BODY.index("hand_right")]))
+        recordings[0].joints[:, other] = torch.nan
+        alone, one_arm = covs(recordings, mirror=True), covs(recordings)
+        ((side, own),) = one_arm.items()
+        torch.testing.assert_close(alone[side], own)
+        torch.testing.assert_close(alone["right"], alone["left"] * sign * sign[:, None])

@@ -112,6 +112,42 @@ def test_one_kind_of_neck_stays_and_an_unknown_one_is_refused():
         collect_poses([low], neck="throat")
 
 
+def test_a_neck_that_these_lack_is_where_others_have_it():
+    low, high = recording(lowered_neck(poses(seed=1))), recording(poses(seed=2))
+    found = collect_poses([low], neck="neck", others=[low, high])
+    together = collect_poses([low, high])
+    assert torch.equal(found.joints, together.joints[:300]) and found.facts["neck"] == "neck"
+    assert collect_poses([high], others=[low]).joints.equal(collect_poses([high]).joints)
+
+
+@pytest.mark.parametrize("neck", [None, "neck"])
+def test_held_out_persons_have_the_neck_of_the_others(neck, monkeypatch):
+    """One person alone has a neck of the wanted kind; without that person the others keep their own."""
+    people = [
+        recording(lowered_neck(poses(60, seed=1)), "a"),
+        recording(lowered_neck(poses(60, seed=2)), "b"),
+        recording(poses(60, seed=3), "c"),
+    ]
+    asked = []
+    monkeypatch.setattr(
+        "torchpose.learning._recipes.upper_body.track_held_out",
+        lambda prior, poses, *_: asked.append((prior.info.neck, poses)) or {},
+    )
+    recipe = UpperBodyRecipe(
+        n_components=2, n_samples=300, pose_steps=2, window_components=0, neck=neck
+    )
+    recipe.hold_out(people, {people[2].person_id})
+    recipe.hold_out(people, {people[0].person_id})
+    assert [(kind, held.facts["neck"]) for kind, held in asked] == [
+        ("mid-shoulder", "mid-shoulder"), ("neck", "neck")
+    ]  # fmt: skip
+    middle = asked[0][1].joints[-60:, [2, 5]].mean(1)  # of the person held out, centred on the neck
+    assert float(middle.norm(dim=-1).max()) < 0.05
+    without = [n for n in UPPER_BODY if n != "neck"]
+    part = recording(poses(40)[:, [UPPER_BODY.index(n) for n in without]], "d", without)
+    assert recipe.hold_out([people[2], part], {people[2].person_id}) == {} and len(asked) == 2
+
+
 def test_missing_necks_are_placed():
     without = [n for n in UPPER_BODY if n != "neck"]
     index = [UPPER_BODY.index(n) for n in without]

@@ -14,14 +14,16 @@ import torch
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.poses import poses
+from torchpose.errors import InputError
 from torchpose.io import read_recordings
 from torchpose.learning._recipes import UpperBodyRecipe
+from torchpose.learning._training import collect_poses
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.priors._upper_body_prior import released_process_cov
 from torchpose.skeleton import UPPER_BODY
 from train.cli import main
 from train.fine_tuning import FineTuning
-from train.fine_tuning_batches import SequenceBatches, batches_of
+from train.fine_tuning_batches import SequenceBatches, _complete, batches_of
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "fine-tune.yaml"
@@ -193,6 +195,27 @@ def test_a_share_depends_on_nothing_but_seed_step_and_number(scene) -> None:
         two.loss(module, 3, 0)
         assert torch.equal(two.loss(module, 4, 1).nan_to_num(), first.nan_to_num())
         assert not torch.equal(two.loss(module, 4, 0).nan_to_num(), first.nan_to_num())
+
+
+def test_recordings_are_cut_where_a_joint_is_missing(scene) -> None:
+    """One missing joint costs its frame, not the recording; the neck is where the training has it."""
+    prior = load_prior(scene.home / "base.safetensors")
+    whole, *_ = scene.recordings
+    joints = whole.joints.clone()
+    joints[3, 0] = joints[14, 5] = torch.nan
+    parts = _complete(prior, [whole, replace(whole, joints=joints)])
+    every = collect_poses([whole], prior.info.neck, prior.info.centre).joints
+    assert [len(part) for part in parts] == [N_FRAMES, 10]
+    assert torch.equal(parts[0], every) and torch.equal(parts[1], every[4:14])
+    with pytest.raises(InputError, match="10 frames in a row"):
+        _complete(prior, [replace(whole, joints=joints[:13])])
+    low = whole.joints.clone()
+    low[:, 4] = low[:, [2, 5]].mean(1)
+    low_neck = [replace(r, joints=low) for r in scene.recordings[2:]]
+    for part in ("poses", "full"):
+        name = "base" if part == "poses" else "windows"
+        prior = load_prior(scene.home / f"{name}.safetensors")
+        batches_of(prior, part, scene.recordings[:2], low_neck, 3, 5)
 
 
 def _first_tensor(batch, *_) -> torch.Tensor:

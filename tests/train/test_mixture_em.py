@@ -2,14 +2,16 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
+from tests.priors.poses import lowered_neck, poses
 from torchpose.errors import FileFormatError, InputError, OverlapError
 from torchpose.io import Recording
-from torchpose.learning._recipes import MixtureTask
+from torchpose.learning._recipes import MixtureTask, UpperBodyRecipe
 from torchpose.learning._recipes.choosing import expand_path, fingerprint
 from torchpose.learning._samplers import BLOCK, TensorSource
 from torchpose.learning._streamed_em import StreamedEM, fit_streamed
@@ -131,6 +133,21 @@ def test_split_by_person():
     twin.joints = recordings[1].joints.clone()
     with pytest.raises(OverlapError):
         split([*recordings, twin], None, ["d"])
+
+
+def test_held_out_persons_have_the_neck_of_the_training(tmp_path):
+    low = lowered_neck(poses(60, seed=2))
+    for name, joints in {"a": poses(60, seed=1), "b": low}.items():
+        np.savez(
+            tmp_path / f"{name}.npz", joints=joints.numpy(), names=np.array(UPPER_BODY), fps=30.0,
+            subject=name, source="x", axes="camera",
+        )  # fmt: skip
+    recipe = UpperBodyRecipe(n_components=2, n_samples=300, window_components=0)
+    data = RecordingsDataModule([str(tmp_path)], recipe, None, held_out=["b"])
+    data.setup("fit")
+    assert Key("pose", held_out=True) in data.sources
+    assert len(data.sources_by_person()) == 1
+    assert data._watched_recipe().poses(data.watched, data.train).facts["neck"] == "neck"
 
 
 def test_fingerprints_tell_recordings_apart():

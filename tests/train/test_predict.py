@@ -252,6 +252,13 @@ def test_results_inside_the_recordings_are_no_recordings(data, prior_file) -> No
         assert len(predict([data], data / "out", settings)) == 7
 
 
+def test_results_of_another_run_are_no_recordings(data, prior_file, tmp_path) -> None:
+    settings = TrackSettings(prior=prior_file)
+    predict([data / "a.npz"], data / "earlier", settings)
+    assert (data / "earlier" / "a.npz").is_file()
+    assert len(find_keypoints([data])) == 7
+
+
 def test_ranks_come_from_torchrun_slurm_or_options(monkeypatch) -> None:
     for name in ("RANK", "WORLD_SIZE", "SLURM_PROCID", "SLURM_NTASKS"):
         monkeypatch.delenv(name, raising=False)

@@ -31,6 +31,8 @@ torchpose fit body --help"""
 _SHOWN_DROPS = 5
 _KEYS = {"n_components": "components", "calibration_folds": "folds"}
 _AT_LEAST_ZERO = ("window_components", "folds", "drawn_pieces")
+_OF_CALIBRATION = ("folds", "drawn_pieces")
+_OF_MIXTURES = ("components", "samples", "seed", "neck", "window_components")
 PYTHON_ONLY = frozenset({
     "n_samples", "pose_steps", "pose_tol", "window_samples", "window_steps", "body_size",
     "bone_lengths", "mirror_share", "camera_matrix", "rotation_order", "mirror", "nose_as_head",
@@ -94,7 +96,7 @@ def run(
         without: persons to leave out, to test on later.
         curate: leave out what jumps or is no body, and say so.
         curation: settings of `CurationSettings`.
-        name: name in the prior's metadata (default that of the file).
+        name: name in the prior's metadata (default that of the file, or of the prior of noise_of).
         licence: licence of the recordings.
         noise: the whole recipe with its noise, windows and calibration (default), or mixtures over single
             poses alone.
@@ -106,7 +108,7 @@ def run(
     from torchpose.io._recordings import find_recordings, read_recordings
     from torchpose.learning._fit_files import check_fit_file, fit_results, write_prior_files
 
-    _check_options(given.values)
+    _check_options(given)
     file = check_fit_file(out)
     everything = read_recordings(find_recordings(recordings), axes)
     pictures = pictures_possible(pictures)
@@ -117,7 +119,7 @@ def run(
         if noise == "none":
             prior = _fit_mixtures(kept, recipe, samples, words)
         elif noise_of is not None:
-            prior = _renew_noise(kept, recipe, noise_of, words["command"])
+            prior = _renew_noise(kept, recipe, noise_of, words | {"name": name})
         else:
             prior = _fit_recipe(kept, recipe, samples, words)
         prior.info = replace(prior.info, extra=prior.info.extra | facts)
@@ -142,7 +144,7 @@ def _fit_mixtures(
 
 
 def _renew_noise(
-    recordings: list["Recording"], recipe: dict[str, Any], before: str, command: str
+    recordings: list["Recording"], recipe: dict[str, Any], before: str, words: dict[str, str]
 ) -> "UpperBodyPrior":
     """Return the prior of an earlier version with process noise and calibration learnt anew."""
     from torchpose.learning._recipes.earlier import renew_noise
@@ -150,7 +152,7 @@ def _renew_noise(
 
     return renew_noise(
         load_prior(before), recordings, calibration_folds=recipe["calibration_folds"],
-        drawn_pieces=recipe["drawn_pieces"], command=command, progress=show_progress(),
+        drawn_pieces=recipe["drawn_pieces"], progress=show_progress(), **words,
     )  # fmt: skip
 
 
@@ -189,10 +191,11 @@ def _without(recordings: list["Recording"], persons: list[str]) -> list["Recordi
     return [r for r in recordings if r.person_id not in out]
 
 
-def _check_options(values: dict[str, Any]) -> None:
+def _check_options(given: Given) -> None:
     """Raise `InputError` for values out of range, and for options that exclude each other."""
     from torchpose.skeleton._upper_body import NECK_KINDS
 
+    values = given.values
     neck = values["neck"]
     if neck is not None and neck not in NECK_KINDS:
         raise InputError(f"--neck must be one of {', '.join(NECK_KINDS)}, got {neck!r}")
@@ -204,6 +207,10 @@ def _check_options(values: dict[str, Any]) -> None:
         raise InputError("--noise-of learns noise; leave --noise out")
     if values["noise"] == "none" and values["window_components"]:
         raise InputError("--window-components applies only with --noise learnt")
+    if values["noise"] == "none":
+        given.refuse(_OF_CALIBRATION, "the calibration, and --noise none does without")
+    if values["noise_of"]:
+        given.refuse(_OF_MIXTURES, "new mixtures, and --noise-of keeps those of a prior")
 
 
 def _count(recordings: list["Recording"]) -> str:

@@ -140,6 +140,7 @@ def fit_manifold(
             print(f"going on after {taken} steps, from {kept}", flush=True)
         run_to_end(fitting, kept, show_progress())
         print(write_manifold_files(fitting, results, file.name, pictures, **facts))
+        kept.unlink(missing_ok=True)
     return 0
 
 

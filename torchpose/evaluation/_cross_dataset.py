@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation._completion import (
@@ -30,11 +31,12 @@ from torchpose.evaluation._completion import (
     with_wrists,
 )
 from torchpose.evaluation._cross_tables import Crossed, add_added, add_cross, plot_cross
-from torchpose.evaluation._person_recordings import by_person
+from torchpose.evaluation._person_recordings import by_person, read_known_persons
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
-from torchpose.io._recordings import Recording, read_recordings
+from torchpose.io._recordings import Recording
+from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.skeleton._upper_body import upper_body_indices
 
@@ -51,6 +53,20 @@ _HELD_SHARE = 4  # one of so many persons is tested, if none is named
 
 _Persons = dict[str, list[Recording]]
 """Recordings by person."""
+
+
+class _DataSets(NamedTuple):
+    """Holds the recordings of each data set, by the name of its folder.
+
+    Attributes:
+        sets: that are crossed, and left out in turn. mocap: that is added.
+        published: whether they are those known by their names. notes: on what is doubtful about them.
+    """
+
+    sets: dict[str, list[Recording]]
+    mocap: dict[str, list[Recording]]
+    published: bool
+    notes: list[str]
 
 
 class _Split(NamedTuple):
@@ -125,8 +141,11 @@ def run(
         recipe: fits the priors.
 
     Raises:
-        InputError: no such data, an unknown `part`. OutputError: `out` cannot be written.
+        InputError: no such data, an unknown `part` or person, settings out of range. OverlapError: one
+            recording under two persons. OutputError: `out` cannot be written.
     """
+    check_count("every", every)
+    check_count("workers", workers)
     if part not in ("both", "cross", "added"):
         raise InputError(f"part must be cross, added or both, got {part!r}")
     folders = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
@@ -135,6 +154,8 @@ def run(
             raise InputError("expected folders of motion capture with --added, got none")
         part = "cross"
     out = check_output_folder(out)
+    read = _read(folders, added, part)
+    _check_tested(read, tested)
     folder = check_output_folder(fits or out)
     settings = fit_settings(
         "cross-dataset", seed, quick, n_components, window_components, window_samples, 0
@@ -147,7 +168,7 @@ def run(
     })  # fmt: skip
     thin = 8 if quick else 1
     if part != "added":
-        sets = _alike(_crossed(folders, tested, thin), seed)
+        sets = _alike(_crossed(read, tested, thin), seed)
         found = run_jobs(_cross_jobs(sets, scoring, common), folder, workers, progress)
         add_cross(report, dict(zip(sets.mean, found, strict=True)), sets.how)
         if sets.completion is not None:
@@ -155,7 +176,7 @@ def run(
             _add_completion(report, {heads: sets.completion})
         draw_picture(report, out, "cross-dataset.png", lambda: plot_cross(report, list(sets.mean)))
     if part != "cross":
-        left_out = _left_out(folders, added, tested, thin, seed, mocap_share)
+        left_out = _left_out(read, thin, seed, mocap_share)
         keys = [(held, label) for held, one in left_out.items() for label in one.trains]
         jobs = [
             Job(", ".join(key), left_out[key[0]].trains[key[1]], left_out[key[0]].tests,
@@ -168,6 +189,7 @@ def run(
         add_added(report, scores, dict(zip(keys, frames, strict=True)))
         completions = {f"without {held}": one.completion for held, one in left_out.items()}
         _add_completion(report, completions)
+    report.findings += read.notes
     report.save(out)
     return report
 
@@ -179,29 +201,70 @@ def _all(persons: Mapping[str, list[Recording]]) -> list[Recording]:
     return [recording for group in persons.values() for recording in group]
 
 
-def _read(folder: Path, thin: int) -> _Persons:
-    """Return recordings of one data set by person; each n-th of every person."""
-    return {person: group[::thin] for person, group in by_person(read_recordings(folder)).items()}
+def _read(folders: Sequence[Path], added: Sequence[str], part: str) -> _DataSets:
+    """Read all data sets that the parts need.
+
+    Raises:
+        InputError: there are none. OverlapError: one recording under two persons.
+    """
+    published = len(folders) == 1
+    if published:
+        sets = _published(folders[0], (_UTD,) if part == "cross" else _KINECT)
+        mocap = _published(folders[0], (_MHAD,) if part == "cross" else _MOCAP)
+    else:
+        sets, mocap = _named(folders), _named(added if part != "cross" else ())
+    read = {
+        folder: read_known_persons(folder)
+        for folder in dict.fromkeys([*sets.values(), *mocap.values()])
+    }
+    refuse_shared_between_persons([r for found in read.values() for r in found.recordings])
+    return _DataSets(
+        {name: read[folder].recordings for name, folder in sets.items()},
+        {name: read[folder].recordings for name, folder in mocap.items()},
+        published,
+        [note for found in read.values() for note in found.notes],
+    )
 
 
-def _published(home: Path, name: str, thin: int) -> _Persons:
-    """Return recordings of a data set that is known by its name."""
-    if not (home / name).is_dir():
-        raise InputError(
-            f"{home}: expected the folder {name} in it, found none; or name two folders or more, one "
-            "for each data set"
-        )
-    return _read(home / name, thin)
+def _published(home: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return folders of data sets that are known by their names."""
+    for name in names:
+        if not (home / name).is_dir():
+            raise InputError(
+                f"{home}: expected the folder {name} in it, found none; or name two folders or more, "
+                "one for each data set"
+            )
+    return {name: home / name for name in names}
 
 
-def _named(folders: Sequence[str | Path], thin: int) -> dict[str, _Persons]:
-    """Return data sets by the names of their folders."""
+def _named(folders: Sequence[str | Path]) -> dict[str, Path]:
+    """Return folders by their names."""
     names = [Path(folder).resolve().name for folder in folders]
     if len(set(names)) < len(names):
         raise InputError(
             f"data sets are told apart by their folders' names, got {', '.join(names)}"
         )
-    return {name: _read(Path(f), thin) for name, f in zip(names, folders, strict=True)}
+    return {name: Path(folder) for name, folder in zip(names, folders, strict=True)}
+
+
+def _thinned(recordings: Sequence[Recording], thin: int) -> _Persons:
+    """Return recordings by person; each n-th of every person."""
+    return {person: group[::thin] for person, group in by_person(recordings).items()}
+
+
+def _check_tested(read: _DataSets, tested: Sequence[str]) -> None:
+    """Raise `InputError` for persons to test whom no data set has, or who are not asked for."""
+    if read.published and tested:
+        raise InputError(
+            f"tested: the published data sets have test persons of their own, got {', '.join(tested)}; "
+            "leave them out, or name two folders or more"
+        )
+    known = [person for recordings in read.sets.values() for person in by_person(recordings)]
+    unknown = [person for person in tested if person not in known]
+    if unknown:
+        raise InputError(
+            f"tested: there is no {', '.join(unknown)}; the persons are {', '.join(known)}"
+        )
 
 
 def _split(persons: _Persons, tested: Sequence[str], name: str) -> _Split:
@@ -226,15 +289,15 @@ def _held_out(persons: _Persons, tested: Sequence[str]) -> list[str]:
     return [person for person in persons if person in tested] or last
 
 
-def _crossed(folders: Sequence[Path], tested: Sequence[str], thin: int) -> dict[str, _Split]:
+def _crossed(read: _DataSets, tested: Sequence[str], thin: int) -> dict[str, _Split]:
     """Return the data sets of the first part by name."""
-    if len(folders) == 1:
-        published = {"UTD": _UTD, "MHAD": _MHAD}
+    if read.published:
+        published = {"UTD": (_UTD, read.sets[_UTD]), "MHAD": (_MHAD, read.mocap[_MHAD])}
         return {
-            short: _split(_published(folders[0], name, thin), _TESTED[short], name)
-            for short, name in published.items()
+            short: _split(_thinned(recordings, thin), _TESTED[short], name)
+            for short, (name, recordings) in published.items()
         }
-    sets = _named(folders, thin)
+    sets = {name: _thinned(recordings, thin) for name, recordings in read.sets.items()}
     return {name: _split(own, _held_out(own, tested), name) for name, own in sets.items()}
 
 
@@ -304,20 +367,17 @@ def _cross_jobs(sets: _Alike, scoring: ScoreSettings, common: dict[str, Any]) ->
 # --- motion capture added -------------------------------------------------------------------------
 
 
-def _left_out(
-    folders: Sequence[Path], added: Sequence[str], tested: Sequence[str], thin: int, seed: int,
-    share: float,
-) -> dict[str, _Held]:  # fmt: skip
+def _left_out(read: _DataSets, thin: int, seed: int, share: float) -> dict[str, _Held]:
     """Return training sets with and without motion capture for every data set that is left out."""
     held: dict[str, tuple[_Persons, dict[str, _Persons]]]
-    if len(folders) == 1:
-        sets = {n: _published(folders[0], n, thin if n == _UTD else 1) for n in _KINECT}
-        mocap = {n: _published(folders[0], n, thin) for n in _MOCAP}
+    few = set(_KINECT) - {_UTD} if read.published else set()  # too few recordings to be thinned
+    sets = {n: _thinned(own, 1 if n in few else thin) for n, own in read.sets.items()}
+    mocap = {n: _thinned(own, thin) for n, own in read.mocap.items()}
+    if read.published:
         labels = "Kinect alone", "with MHAD", "with all motion capture"
         some = _split(sets[_UTD], _TESTED["UTD"], _UTD)
         extra = {"UTD s7, s8": (some.tested, sets | {_UTD: some.train})}
     else:
-        sets, mocap = _named(folders, thin), _named(added, thin)
         labels, extra = ("alone", f"with {next(iter(mocap))}", "with all motion capture"), {}
     held = {name: (own, {n: p for n, p in sets.items() if n != name}) for name, own in sets.items()}
     pieces = {

@@ -17,9 +17,16 @@ from typing import Any
 
 import torch
 
+from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation._person_recordings import by_person, renamed, spread
+from torchpose.evaluation._person_recordings import (
+    KnownPersons,
+    by_person,
+    read_known_persons,
+    renamed,
+    spread,
+)
 from torchpose.evaluation._person_tables import (
     Curve,
     add_pose_classes,
@@ -30,7 +37,8 @@ from torchpose.evaluation._person_tables import (
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
-from torchpose.io._recordings import Recording, read_recordings
+from torchpose.io._recordings import Recording
+from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["cyclic_subsets", "halves", "run"]
@@ -74,7 +82,8 @@ def run(
         counts: the numbers of training persons; where none is given 1, 2, 4 and so on up to all, and for
             the published data sets 1, 2, 4, 7 and 9.
         n_subsets: the number of fits for each count, at most one for each person.
-        n_own: the number of persons for whom a prior of their own is fitted; 0 leaves that part out.
+        n_own: the number of persons for whom a prior of their own is fitted; 0 leaves that part out, and
+            persons with one recording are left out of it.
         n_components: the number of Gaussians per arm over poses; by default that of the recipe.
         window_components: the number of Gaussians per arm over windows; by default that of the recipe.
         window_samples: the number of training windows; by default that of the recipe.
@@ -85,33 +94,40 @@ def run(
         recipes: names and functions, instead of all that.
 
     Raises:
-        InputError: no such data, more training persons than there are, an unknown recipe.
-        OutputError: `out` cannot be written.
+        InputError: no such data, more training persons than there are, an unknown recipe, settings out
+            of range. OverlapError: one recording under two persons. OutputError: `out` cannot be written.
     """
+    for setting, value in {"every": every, "workers": workers, "n_subsets": n_subsets}.items():
+        check_count(setting, value)
+    for count in counts:
+        check_count("counts", count)
     out = check_output_folder(out)
     known = list(recipes or [("this recipe", fit_kinect_prior), *map(_imported, compare)])
     folders, further, usual = _sources(data, more)
-    persons = by_person(read_recordings(folders))
+    recordings, notes = read_known_persons(folders)
+    persons = by_person(recordings)
     if len(persons) < 2:
         raise InputError(f"a learning curve needs two persons or more, got {', '.join(persons)}")
     counts = counts or usual or _doubling(len(persons) - 1)
     if quick:
         persons = {name: group[::5] for name, group in persons.items()}
         counts, n_subsets, n_own = tuple(c for c in counts if c in counts[:2]), 2, min(1, n_own)
-    others = _others(further, len(persons) - 1, max(counts))
+    others, more_notes = _others(further, len(persons) - 1, max(counts))
+    refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
     settings = fit_settings(
         "learning-curve", seed, quick, n_components, window_components, window_samples, 0
     )
     scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
     jobs: dict[tuple[str, int, int], Job] = {}
     own: dict[tuple[str, str, str], Job] = {}
+    divided = [name for name, group in persons.items() if len(group) > 1]
     for name, recipe in known:
         for count in counts:
             for i, subset in enumerate(cyclic_subsets(list(persons), count, n_subsets)):
                 jobs[name, count, i] = _curve_job(
                     persons, others, subset, count, settings, recipe, scoring
                 )
-        for person in list(persons)[:n_own]:
+        for person in divided[:n_own]:
             for kind, job in _own_jobs(persons, person, settings, recipe, scoring).items():
                 own[name, person, kind] = job
     folder = check_output_folder(fits or out)
@@ -128,6 +144,12 @@ def run(
         _add_own(report, own, scores)
     _add_classes(report, known[0][0], counts, jobs, scores)
     _add_findings(report, curves)
+    whole = [name for name in persons if name not in divided]
+    if n_own and whole:
+        report.findings.append(
+            f"Not tested on a prior of their own, with one recording only: {', '.join(whole)}."
+        )
+    report.findings += [*notes, *more_notes]
     title = "Persons never seen: error over the number of training persons"
     draw_picture(report, out, "learning-curve.png", lambda: plot_curves(curves, title))
     report.save(out)
@@ -203,19 +225,22 @@ def _doubling(most: int) -> tuple[int, ...]:
     return tuple(sorted({min(2**i, most) for i in range(most.bit_length() + 1)}))
 
 
-def _others(folders: Sequence[Path], most: int, count: int) -> dict[str, list[Recording]]:
-    """Return the missing number of further training persons."""
+def _others(
+    folders: Sequence[Path], most: int, count: int
+) -> tuple[dict[str, list[Recording]], list[str]]:
+    """Return the missing number of further training persons, and notes on their recordings."""
     missing = count - most
     if missing <= 0:
-        return {}
-    others = by_person(read_recordings(folders)) if folders else {}
+        return {}, []
+    recordings, notes = read_known_persons(folders) if folders else KnownPersons([], [])
+    others = by_person(recordings)
     if missing > len(others):
         raise InputError(
             f"{count} training persons are asked for, and there are {most} beside the one who is "
             f"tracked, and {len(others)} further ones; name recordings of others with --more, or "
             "smaller --counts"
         )
-    return dict(list(others.items())[:missing])
+    return dict(list(others.items())[:missing]), notes
 
 
 def _curve_job(
@@ -242,11 +267,14 @@ def _own_jobs(
     recipe: Recipe,
     scoring: ScoreSettings,
 ) -> dict[str, Job]:
-    """Return fits to a person's first half, of all others, and of both; scored on second halves."""
+    """Return fits to a person's first half, of all others, and of both; scored on second halves.
+
+    Persons with one recording have no second half, and are trained on only.
+    """
     first, _ = halves(persons[person])
     mine = renamed(first, "first half")
     rest = [r for name, group in persons.items() if name != person for r in group]
-    later = {name: halves(group)[1] for name, group in persons.items()}
+    later = {name: halves(group)[1] for name, group in persons.items() if len(group) > 1}
     on = {person: later[person]}
     return {
         "one": Job(f"{person} alone", mine, later, settings, recipe, scoring),

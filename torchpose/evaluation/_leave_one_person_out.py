@@ -10,9 +10,15 @@ from typing import Any
 
 import torch
 
+from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation._person_recordings import POSE_CLASSES, by_person, spread
+from torchpose.evaluation._person_recordings import (
+    POSE_CLASSES,
+    by_person,
+    read_known_persons,
+    spread,
+)
 from torchpose.evaluation._person_tables import (
     add_persons,
     add_pose_classes,
@@ -23,7 +29,7 @@ from torchpose.evaluation._person_tables import (
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
-from torchpose.io._recordings import read_recordings
+from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["run"]
@@ -60,16 +66,20 @@ def run(
         recipe: fits the priors.
 
     Raises:
-        InputError: no such data, or one person alone. OutputError: `out` cannot be written.
+        InputError: no such data, one person alone, or settings out of range. OverlapError: one
+            recording under two persons. OutputError: `out` cannot be written.
     """
+    check_count("every", every)
+    check_count("workers", workers)
     out = check_output_folder(out)
-    recordings = read_recordings(data)
+    recordings, notes = read_known_persons(data)
     persons = by_person(recordings)
     if len(persons) < 2:
         raise InputError(
             f"expected recordings of two persons or more, got {len(recordings)} of "
             f"{', '.join(persons)}; add a folder with those of others"
         )
+    refuse_shared_between_persons(recordings)
     settings = fit_settings(
         "leave-one-person-out", seed, quick, n_components, window_components, window_samples,
         calibration_folds,
@@ -100,6 +110,7 @@ def run(
         table.note += " The covariances are not calibrated."
     add_pose_classes(report, {"all": pooled(list(scored.values()))})
     _add_findings(report, scored)
+    report.findings += notes
     title = "3D error of each person under a prior of the others"
     draw_picture(report, out, "persons.png", lambda: plot_persons(scored, title))
     report.save(out)

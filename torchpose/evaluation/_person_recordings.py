@@ -3,21 +3,25 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.io._recordings import Recording
+from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._curation.joints import measured, runs
+from torchpose.learning._curation.splits import same_names
 
 __all__ = [
     "LEAST_FRAMES",
     "POSE_CLASSES",
+    "KnownPersons",
     "by_person",
     "complete_pieces",
     "pose_classes",
+    "read_known_persons",
     "renamed",
     "spread",
 ]
@@ -57,17 +61,41 @@ def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:
     return torch.where(raised, 0, torch.where(crossed, 1, torch.where(near, 2, 3)))
 
 
+class KnownPersons(NamedTuple):
+    """Holds recordings of persons whom their files name, and sentences on what is doubtful about them."""
+
+    recordings: list[Recording]
+    notes: list[str]
+
+
+def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons:
+    """Read recordings, without other people in a person's file: nobody says who they are.
+
+    Raises:
+        InputError, FileFormatError, SkeletonError, MissingDependencyError: as `read_recordings`.
+    """
+    recordings = read_recordings(paths)
+    known = [r for r in recordings if not r.companion]
+    others = [r for r in recordings if r.companion]
+    files = sorted({r.path.name for r in others if r.path is not None})
+    notes = [
+        f"Other people in {', '.join(files)} are left out ({len(others)} recordings): nobody says who "
+        "they are."
+    ] * bool(others)
+    return KnownPersons(known, notes + [f"{note}." for note in same_names(known)])
+
+
 def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
-    """Return recordings of each person, under a name that no other one has, in order."""
+    """Return recordings of each person, under a name that no other one has, in order.
+
+    The name is the short one of the person, or the whole `Recording.person_id` where several have it.
+    """
     groups: dict[str, list[Recording]] = {}
     for recording in recordings:
         groups.setdefault(recording.person_id, []).append(recording)
     short = {key: _short_name(group[0]) for key, group in groups.items()}
-    names = list(short.values())
-    unique = {
-        key: name if names.count(name) == 1 else f"{_folder(groups[key][0])} {name}"
-        for key, name in short.items()
-    }
+    names = [*short.values(), *groups]
+    unique = {key: name if names.count(name) == 1 else key for key, name in short.items()}
     return {unique[key]: groups[key] for key in sorted(groups, key=lambda k: _natural(unique[k]))}
 
 

@@ -18,7 +18,12 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError, OverlapError
-from torchpose.evaluation._person_recordings import by_person, pose_classes, spread
+from torchpose.evaluation._person_recordings import (
+    by_person,
+    pose_classes,
+    read_known_persons,
+    spread,
+)
 from torchpose.evaluation._person_tables import (
     add_persons,
     add_pose_classes,
@@ -42,7 +47,7 @@ from torchpose.evaluation._unseen import (
     log_likelihood,
     poses_to_score,
 )
-from torchpose.io._recordings import Recording, read_recordings
+from torchpose.io._recordings import Recording
 from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
 from torchpose.priors._arms import shipped_arm_prior
 from torchpose.priors._upper_body_prior import UpperBodyPrior, load_prior
@@ -100,7 +105,7 @@ def run(
     _check(method, joints, noise_std, every)
     out = check_output_folder(out)
     prior = load_prior("kinect-upper-body") if prior is None else prior
-    recordings = read_recordings(data)
+    recordings, notes = read_known_persons(data)
     scored = {r.person_id for r in recordings}
     in_arms = _known_to_arms(scored, method or _usual(prior, _SEEN[joints]))
     known = sorted(scored & {*prior.info.persons, *in_arms})
@@ -121,6 +126,7 @@ def run(
     add_persons(report, by_name)
     add_pose_classes(report, {"all": pooled(list(by_name.values()))})
     _add_findings(report, found, known)
+    report.findings += notes
     title = f"3D error of each person under {prior.info.name or 'the prior'}"
     draw_picture(report, out, "persons.png", lambda: plot_persons(by_name, title))
     report.save(out)

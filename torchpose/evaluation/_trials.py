@@ -25,6 +25,7 @@ from torchpose.evaluation._report import RESULTS, Report
 from torchpose.filters._recursive_filter import Generators
 from torchpose.io._recordings import Recording
 from torchpose.io._results import replace_own
+from torchpose.learning._recipes.choosing import fingerprint
 from torchpose.math._rotations import euler_to_matrix
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -75,7 +76,7 @@ def cached_prior(
     """Fit a prior, or read it from `out` if the same one was fitted there before.
 
     The file's name holds a hash of the recipe's name and version (`VERSION` of its module, else that
-    of torchpose), of the settings and of every recorded number.
+    of torchpose), of the settings, and of all that the recordings hold.
 
     Args:
         out: folder. recordings: to fit to. recipe: see `Recipe`. progress: whether to show bars.
@@ -84,7 +85,7 @@ def cached_prior(
     module = import_module(recipe.__module__)
     version = getattr(module, "VERSION", "") or package_version()
     facts: list[Any] = [recipe.__module__, recipe.__qualname__, str(version), settings]
-    facts += [fact for r in recordings for fact in (r.person_id, r.joints)]
+    facts.append(fingerprint(recordings))
     path = out / f"prior-{settings_hash(facts)}.safetensors"
     if path.is_file():
         try:

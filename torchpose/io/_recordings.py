@@ -273,7 +273,7 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
     except SkeletonError as error:
         raise SkeletonError(f"{where}: {error}") from error
     notes = list(raw.notes)
-    joints = _missing(raw, notes)
+    joints = _trusted(raw, _missing(raw, notes))
     tensor = torch.from_numpy(joints)
     tensor = tensor * (1.0 if raw.unit is None else raw.unit)
     unit = body_unit(where, tensor, raw.names)
@@ -348,6 +348,18 @@ def _missing(raw: RawRecording, notes: list[str]) -> np.ndarray:
         frames = frame_ranges(np.flatnonzero(empty).tolist(), raw.first_frame)
         notes.append(f"no body (all joints at zero) in frames {frames}")
     notes += _zero_notes(zero & ~empty[:, None], raw)
+    return joints
+
+
+def _trusted(raw: RawRecording, joints: np.ndarray) -> np.ndarray:
+    """Return the joints, NaN where their weight is zero: a sensor that lost a joint still writes a place."""
+    if raw.weights is None:
+        return joints
+    joints = np.where((raw.weights == 0)[..., None], np.nan, joints)
+    if np.isnan(joints).all():
+        raise InputError(
+            f"{raw.where()}: every joint has weight 0 or is missing; expected some that are tracked"
+        )
     return joints
 
 

@@ -126,13 +126,14 @@ def motion_sequence(
     joints: Float[Tensor, "T J 3"],
     fps: float,
     person: str,
+    origin: str | None = None,
 ) -> MotionSequence:
     """Return a recording as motion of an articulation.
 
     Args:
         articulation: whose centres the body has. body: of the person. states: fitted to the joints.
         joints: [T, J, 3], metres; NaN in all frames where the set lacks a joint. fps: of both.
-        person: id, `origin#name`.
+        person: id, `origin#name`. origin: of the set that the recording is of; by default that in the id.
     """
     check_rate("fps", fps)
     n, shifted = len(states), list(articulation.shifted)
@@ -150,7 +151,7 @@ def motion_sequence(
     rigid = body.bone_lengths[shifted, None] * standard
     residual = (carried.mT @ bones[..., None]).squeeze(-1) - rigid
     known = joints.isfinite().all(-1).all(0)
-    origin = person.partition("#")[0]
+    origin = person.partition("#")[0] if origin is None else origin
     return MotionSequence(origin, person, fps, point, residual, body.bone_lengths, known)
 
 
@@ -226,6 +227,18 @@ def _check_joints(articulation: Articulation, sets: _Sets) -> None:
     if missing:
         raise InputError(
             f"no recording has the joint {', '.join(missing)}; add recordings of a joint set with it"
+        )
+    told = torch.stack([_known_columns(articulation, own) for own in sets.values()]).any(0)[3:]
+    parts = articulation.axis_part[~told].unique().tolist()
+    if parts:
+        together = [
+            ", ".join(n for n, p in zip(articulation.skeleton.names, articulation.part_of, strict=True)
+                      if int(p) == part)
+            for part in parts
+        ]  # fmt: skip
+        raise InputError(
+            f"no set of recordings has all of the joints {'; or '.join(together)}, which tell how a part "
+            "turns; add recordings of a joint set with them"
         )
 
 
@@ -459,20 +472,39 @@ def _draw_poses(
 ) -> Float[Tensor, "N Q"]:
     """Return poses of all sets, with shares as the roots of their durations.
 
-    Angles that a set does not tell are those of random poses of the sets that tell them.
+    Angles that a set does not tell are those of random poses of the sets that tell them (`_donors`).
     """
     root = articulation.n_root
     poses = {origin: _poses(articulation, own) for origin, own in sets.items()}
     known = {o: _known_columns(articulation, own)[3 + root :] for o, own in sets.items()}
     roots = {origin: math.sqrt(len(own)) for origin, own in poses.items()}
+    donors = _donors(list(poses.values()), torch.stack(list(known.values())))
     drawn = []
     for origin, own in poses.items():
         share = max(1, round(count * roots[origin] / sum(roots.values())))
         values = own[_random(len(own), share, generator)]
-        told = torch.cat([p for o, p in poses.items() if bool(known[o].all())] or [own])
-        others = told[_random(len(told), share, generator)]
-        drawn.append(torch.where(known[origin], values, others))
+        for angles, told in donors:
+            others = told[_random(len(told), share, generator)]
+            values = torch.where(known[origin] | ~angles, values, others)
+        drawn.append(values)
     return torch.cat(drawn)
+
+
+def _donors(
+    poses: Sequence[Float[Tensor, "_ Q"]], known: Bool[Tensor, "K Q"]
+) -> list[tuple[Bool[Tensor, " Q"], Float[Tensor, "N Q"]]]:
+    """Return groups of angles, with the poses that they may be taken from.
+
+    Whole poses where sets tell all angles, else those of the sets that tell the group.
+    """
+    whole = [own for own, told in zip(poses, known, strict=True) if bool(told.all())]
+    if whole:
+        return [(torch.ones_like(known[0]), torch.cat(whole))]
+    who, group = torch.unique(known, dim=1, return_inverse=True)
+    return [
+        (group == i, torch.cat([own for own, told in zip(poses, tells, strict=True) if told]))
+        for i, tells in enumerate(who.mT.tolist())
+    ]
 
 
 def _poses(articulation: Articulation, sequences: Sequence[MotionSequence]) -> Tensor:

@@ -111,11 +111,13 @@ def collect_poses(
     neck: str | None = None,
     centre: str = "neck",
     nose_as_head: bool = False,
+    others: Sequence[RecordingLike] = (),
 ) -> PoseSet:
     """Collect centred upper-body poses of recordings, converted to one kind of neck.
 
     Necks of other kinds, and missing ones, are put where the recordings of the wanted kind have
-    theirs (`learn_neck_offset`). Hands and wrists are not converted: mixed, they are refused.
+    theirs (`learn_neck_offset`), or where `others` have it if none of these is of that kind. Hands and
+    wrists are not converted: mixed, they are refused.
 
     Args:
         recordings: the recordings, in camera axes.
@@ -123,6 +125,7 @@ def collect_poses(
         centre: "neck" or "head": every pose is centred on that joint; "sequence": every recording
             on the mean of its neck.
         nose_as_head: take the nose where a joint set has no head.
+        others: recordings that tell where the neck is, such as the training's beside held-out ones.
 
     Raises:
         InputError: no recordings. PriorError: hands and wrists (or heads and noses) mixed, a neck
@@ -143,6 +146,8 @@ def collect_poses(
     extra: dict[str, Any] = {"head": head}
     if any(kind != wanted for kind in kinds):
         genuine = [j for j, kind in zip(joints, kinds, strict=True) if kind == wanted]
+        beside = [r.upper_body(nose_as_head) for r in others] if not genuine else []
+        genuine = genuine or [b.joints.to(torch.float64) for b in beside if b.neck == wanted]
         offset = learn_neck_offset(torch.cat(genuine) if genuine else joints[0][:0])
         joints = [
             j if kind == wanted else place_neck(j, offset)

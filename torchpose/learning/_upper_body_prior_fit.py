@@ -182,7 +182,8 @@ def increment_covs(
         mirror: pool left arms and mirrored right ones.
 
     Returns:
-        S in pixels, metres and radians for the sides that have steps at all.
+        S in pixels, metres and radians for the sides that have steps at all; with `mirror` for both, if
+        one has.
     """
     order = check_rotation_order(rotation_order)
     rate = poses.facts["fps"] or DEFAULT_RATE
@@ -199,8 +200,8 @@ def increment_covs(
             trust = _trust(poses, arm, used)
             weight = trust * _rates(poses)[used] / rate
             found[side] = (steps * weight[:, None]).mT @ steps / trust.sum()
-    if mirror and len(found) == 2:
-        pooled = (found["left"] + found["right"]) / 2
+    if mirror and found:
+        pooled = torch.stack(list(found.values())).mean(0)
         found = {"left": pooled, "right": mirror_covariance(pooled)}
     turning = torch.zeros(STATE_DIM, dtype=torch.float64)
     turning[ANGLES] = _ANGLE_STEP**2 * 30.0 / rate

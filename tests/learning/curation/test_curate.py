@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -142,6 +143,11 @@ def test_notes_are_counted_and_folders_of_one_name_are_said(tmp_path):
     notes = curate(same).report.notes
     assert "taken for millimetres (2 recordings)" in notes
     assert any("2 folders count as the one person ann#" in note for note in notes)
+    named = [
+        replace(recording(day, joints=moving(150, seed=i)), person="ann")
+        for i, day in enumerate(("a", "b"))
+    ]
+    assert any("a#ann, b#ann count as 2 persons" in note for note in curate(named).report.notes)
 
 
 @pytest.mark.data

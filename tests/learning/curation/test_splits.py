@@ -1,5 +1,7 @@
 """Persons stay on one side, and copies are found under any name."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -44,6 +46,24 @@ def test_split_persons():
             split_persons(everybody(), wanted)
     with pytest.raises(InputError, match="two or more"):
         leave_one_person_out(everybody()[:2])
+
+
+def test_one_name_in_several_folders_is_doubtful():
+    """Without a source, each folder's person counts apart; nobody is left out, but it is said."""
+    days = [
+        replace(recording(day, name, moving(60, seed=10 * d + n)), person=name)
+        for d, day in enumerate(("monday", "tuesday"))
+        for n, name in enumerate(("ann", "bob"))
+    ]
+    with pytest.warns(UserWarning, match="monday#(ann|bob), tuesday#.* count as 2 persons") as all_:
+        assert len(list(leave_one_person_out(days))) == 4
+    assert len(all_) == 2
+    with pytest.warns(UserWarning, match="monday#ann, tuesday#ann count as 2 persons") as told:
+        split_persons(days, ["monday#ann"])
+    assert len(told) == 1
+    split_persons(days, ["monday#ann", "tuesday#ann"])  # on one side
+    leave_one_person_out([replace(r, source=f"{r.person}/set@0") for r in days])
+    leave_one_person_out([replace(r, person="") for r in days])
 
 
 def test_companions_of_a_test_person_are_on_neither_side():

@@ -209,7 +209,7 @@ def _state_weights(states: np.ndarray, layout: _Layout, notes: list[str]) -> np.
     found = set(np.unique(states).tolist())
     if found <= {0.0, 1.0, 2.0} and (2.0 in found or layout.skeleton == "kinect-v2-25"):
         return np.array(SENSOR_WEIGHTS)[states.astype(int)]
-    if found <= {0.0, 1.0}:
+    if found <= {0.0, 1.0} and 1.0 in found:
         return states
     notes.append("the fourth number of each joint is no tracking state and is not used")
     return None

@@ -30,6 +30,7 @@ from torchpose.learning._curation.splits import (
     check_kinds,
     describe_duplicate,
     refuse_shared_between_persons,
+    same_names,
     skeleton_counts,
 )
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -278,10 +279,10 @@ def _notes(recordings: Sequence[Recording], settings: CurationSettings) -> tuple
     if len(sets) > 1:
         mixed = ", ".join(f"{name} {n}" for name, n in sets.items())
         notes.append(f"joint sets are mixed: {mixed} recordings; necks are converted to one kind")
-    return (*notes, *_same_names(recordings))
+    return (*notes, *_same_folders(recordings), *same_names(recordings))
 
 
-def _same_names(recordings: Sequence[Recording]) -> list[str]:
+def _same_folders(recordings: Sequence[Recording]) -> list[str]:
     """Return notes on folders of one name, which count as one person though they are several."""
     folders: dict[str, set[Any]] = {}
     for r in recordings:

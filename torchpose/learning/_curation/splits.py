@@ -1,5 +1,6 @@
 """Split persons into training and test without leaks: duplicates, shared recordings, kinds of joints."""
 
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ __all__ = [
     "refuse_leaks",
     "refuse_shared_between_persons",
     "refuse_shared_recordings",
+    "same_names",
     "skeleton_counts",
     "split_persons",
 ]
@@ -144,6 +146,24 @@ def persons_of(recordings: Iterable[Recording]) -> list[str]:
     return sorted({r.person_id for r in recordings if not r.companion})
 
 
+def same_names(recordings: Iterable[Recording]) -> list[str]:
+    """Return notes on names that files in several folders give: each folder's person counts apart.
+
+    Files that state their source are passed over, since it tells what they belong to.
+    """
+    ids: dict[str, set[str]] = {}
+    for recording in recordings:
+        if recording.person and not recording.source and not recording.companion:
+            ids.setdefault(recording.person, set()).add(recording.person_id)
+    return [
+        f"{', '.join(sorted(found))} count as {len(found)} persons, since no file states a source; if "
+        f"they are one person, {name} may be in training and test: put the files into one folder, or "
+        "give them the same source"
+        for name, found in ids.items()
+        if len(found) > 1
+    ]
+
+
 def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
     """Return the ids of the named persons; a name may leave out its origin.
 
@@ -175,6 +195,7 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
     """Split recordings into those of some persons for the test and those of all others for training.
 
     Other people in a file of a test person are on neither side, because nobody says who they are.
+    A warning tells of files on both sides that give one name, in different folders.
 
     Args:
         recordings: all of them.
@@ -189,6 +210,8 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
     """
     split = _split(recordings, sorted(set(test_persons)))
     refuse_leaks(split.train, split.test)
+    apart = {*same_names(split.train), *same_names(split.test)}
+    _warn([note for note in same_names([*split.train, *split.test]) if note not in apart])
     return split
 
 
@@ -212,6 +235,8 @@ def _split(recordings: Sequence[Recording], wanted: list[str]) -> PersonSplit:
 def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSplit]:
     """Return one split per person, in the order of their ids, with that person as the test.
 
+    A warning tells of files that give one name, in different folders.
+
     Args:
         recordings: the recordings of two persons or more.
 
@@ -228,7 +253,13 @@ def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSpli
             "; a folder stands for a person where files do not name one"
         )
     refuse_shared_between_persons(recordings)
+    _warn(same_names(recordings))
     return (_split(recordings, [person]) for person in persons)
+
+
+def _warn(notes: Iterable[str]) -> None:
+    for note in notes:
+        warnings.warn(note, stacklevel=3)  # who called the public function
 
 
 def refuse_leaks(train: Sequence[Recording], test: Sequence[Recording]) -> None:

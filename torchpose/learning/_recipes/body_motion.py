@@ -33,6 +33,7 @@ from torchpose.learning._recipes.choosing import (
 )
 from torchpose.math._rotations import matrix_to_quaternion_vector
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
+from torchpose.skeleton._joint_sets import canonical_names
 
 __all__ = ["MotionSpread", "RecordedMotion", "fit_motion", "motion_summary"]
 
@@ -96,8 +97,11 @@ class RecordedMotion:
             body = bodies[recording.person_id]
             states = state_of(body, recording, points)
             found.append(
-                motion_sequence(articulation, body, states, points, rate, recording.person_id)
-            )
+                motion_sequence(
+                    articulation, body, states, points, rate, recording.person_id,
+                    _set_of(recording),
+                )
+            )  # fmt: skip
         return cls(fps, found[:n], found[n:], learnt, watched)
 
     def identity(self) -> dict[str, Any]:
@@ -107,6 +111,16 @@ class RecordedMotion:
             "recordings": fingerprint(self.fitted),
             "held-out recordings": fingerprint(self.held_out),
         }
+
+
+def _set_of(recording: Recording) -> str:
+    """Return the set that a recording is of: its origin, or its joint set if it states no source.
+
+    A folder may hold one person only, and what differs between sets is how they define joints.
+    """
+    if recording.source:
+        return recording.person_id.partition("#")[0]
+    return recording.skeleton or " ".join(sorted(canonical_names(recording.names)))
 
 
 class MotionSpread(NamedTuple):

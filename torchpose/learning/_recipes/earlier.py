@@ -39,6 +39,8 @@ def renew_noise(
     *,
     calibration_folds: int = 6,
     drawn_pieces: int = 6,
+    name: str = "",
+    licence: str = "",
     command: str = "",
     progress: bool = False,
 ) -> UpperBodyPrior:
@@ -50,7 +52,7 @@ def renew_noise(
     Args:
         prior: that the recipe fitted. recordings: those that it was fitted on.
         calibration_folds: groups of persons that are held out in turn. drawn_pieces: of each.
-        command: to be noted. progress: whether to show a bar.
+        name, licence: instead of the prior's own. command: to be noted. progress: whether to show a bar.
 
     Raises:
         InputError: recordings of other persons than the prior's.
@@ -76,6 +78,9 @@ def renew_noise(
     )
     kept = {name: v for name, v in prior.noise.items() if not name.startswith("process_cov")}
     noise = kept | recipe.process_noise(prior, recordings)
-    info = replace(info, extra=info.extra | {"noise": {"recipe": VERSION, "command": command}})
+    info = replace(
+        info, name=name or info.name, licence=licence or info.licence,
+        extra=info.extra | {"noise": {"recipe": VERSION, "command": command}},
+    )  # fmt: skip
     renewed = UpperBodyPrior(prior.left, prior.right, info, noise, prior.windows)
     return recipe.calibrate(renewed, recordings, progress)

@@ -243,8 +243,8 @@ def run_to_end(
     """Take steps until the fit is finished.
 
     Args:
-        fitting: at its start, or taken up. kept: file that holds the fit after every step, and is
-            removed at the end; None keeps nothing. progress: show a bar.
+        fitting: at its start, or taken up. kept: file that holds the fit after every step; who writes
+            the manifold removes it then. None keeps nothing. progress: show a bar.
     """
     with tqdm(
         total=fitting.recipe.steps, desc="manifold", unit="step", disable=not progress,
@@ -254,27 +254,33 @@ def run_to_end(
             found = fitting.step()
             if kept is not None:
                 with atomic_path(kept) as temporary:
-                    torch.save({"of": fitting.identity(), "fit": fitting.state_dict()}, temporary)
+                    kept_fit = {"of": _same_for(fitting), "fit": fitting.state_dict()}
+                    torch.save(kept_fit, temporary)
             bar.set_postfix_str(f"held-out error {found['held_out']:.5f}", refresh=False)
             bar.update()
-    if kept is not None:
-        Path(kept).unlink(missing_ok=True)
     return fitting
 
 
+def _same_for(fitting: ManifoldFitting) -> dict[str, Any]:
+    """Return what is equal for fits of which one goes on with the other, whenever they end."""
+    identity = fitting.identity()
+    settings = {k: v for k, v in identity["settings"].items() if k not in ("steps", "patience")}
+    return identity | {"settings": settings}
+
+
 def taken_up(fitting: ManifoldFitting, kept: str | Path) -> int:
-    """Restore a fit that `run_to_end` kept, if it is the same one; return its steps so far, or 0.
+    """Restore a fit that `run_to_end` kept; return its steps so far, or 0 without any.
 
     Raises:
-        OutputError: the file is something else, which `run_to_end` would write over.
+        OutputError: the file is another fit, or something else, which `run_to_end` would write over.
     """
     if not os.path.lexists(kept):
         return 0
     try:
         found = torch.load(kept, weights_only=True)
-        if found["of"] != fitting.identity():
-            return 0
-        fitting.load_state_dict(found["fit"])
+        same = found["of"] == _same_for(fitting)
+        if same:
+            fitting.load_state_dict(found["fit"])
     except (
         OSError,
         RuntimeError,
@@ -286,6 +292,11 @@ def taken_up(fitting: ManifoldFitting, kept: str | Path) -> int:
         raise OutputError(
             f"{kept}: is in the place where a fit is kept, and is none; move it away"
         ) from error
+    if not same:
+        raise OutputError(
+            f"{kept}: holds a fit to other recordings, or with other settings, that was interrupted; "
+            "remove it, or repeat that fit to go on with it"
+        )
     return len(fitting.fit.scores)
 
 

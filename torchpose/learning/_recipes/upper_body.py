@@ -159,11 +159,14 @@ class UpperBodyRecipe:
             calibration_folds=0,
         )
 
-    def poses(self, recordings: Sequence[RecordingLike]) -> PoseSet:
+    def poses(
+        self, recordings: Sequence[RecordingLike], others: Sequence[RecordingLike] = ()
+    ) -> PoseSet:
         """Collect the poses that are fitted, centred on the neck.
 
         Args:
             recordings: the recordings, in camera axes, metres.
+            others: recordings that tell where the neck is, if none of these does (`collect_poses`).
 
         Returns:
             `PoseSet` of all recordings, with one kind of neck.
@@ -171,16 +174,18 @@ class UpperBodyRecipe:
         Raises:
             InputError, PriorError: as `collect_poses`.
         """
-        return collect_poses(recordings, self.neck, "neck", self.nose_as_head)
+        return collect_poses(recordings, self.neck, "neck", self.nose_as_head, others)
 
-    def tasks(self, recordings: Sequence[RecordingLike]) -> dict[str, MixtureTask]:
+    def tasks(
+        self, recordings: Sequence[RecordingLike], others: Sequence[RecordingLike] = ()
+    ) -> dict[str, MixtureTask]:
         """Return the mixtures to fit, by name.
 
         Names are "pose" (and "pose.right" where arms are not mirrored), "causal.left", "causal.right",
         "full.left" and "full.right".
 
         Args:
-            recordings: the recordings, in camera axes, metres.
+            recordings: the recordings, in camera axes, metres. others: see `poses`.
 
         Returns:
             `MixtureTask` by name; each can be fitted in a process of its own.
@@ -188,7 +193,7 @@ class UpperBodyRecipe:
         Raises:
             InputError: no usable frames. PriorError: kinds of joints that cannot be mixed.
         """
-        poses = self.poses(recordings)
+        poses = self.poses(recordings, others)
         arms = self._arms(poses)
         tasks = {}
         for name, source in (("pose", arms.left), ("pose.right", arms.right)):
@@ -344,19 +349,27 @@ class UpperBodyRecipe:
     ) -> dict[str, HeldOut]:
         """Return the errors on some persons, tracked with a fit of half the size to all others.
 
+        The neck is that of the others, where they lack the recipe's kind; so held-out persons have
+        it too.
+
         Args:
             recordings: the recordings of all persons.
             persons: ids (`Recording.person_id`) of those held out.
 
         Returns:
-            `HeldOut` by mode of tracking: errors and covariances of 3D joints, metres.
+            `HeldOut` by mode of tracking: errors and covariances of 3D joints, metres. None if the others
+            have no neck, since nothing can be fitted to them.
 
         Raises:
             InputError, PriorError: as `tasks`, of the recordings that are left.
         """
         seen = [r for r in recordings if r.person_id not in persons]
-        partial = self.smaller().fit(seen)
-        poses = self.poses(recordings)
+        kinds = {r.upper_body(self.nose_as_head).neck for r in seen}
+        if kinds == {None}:
+            return {}
+        neck = self.neck if self.neck in kinds else None
+        partial = replace(self.smaller(), neck=neck).fit(seen)
+        poses = replace(self, neck=partial.info.neck).poses(recordings)
         return track_held_out(partial, poses, persons, self.seed, self.drawn_pieces)
 
     def finish(self, prior: UpperBodyPrior, parts: Sequence[dict[str, HeldOut]]) -> UpperBodyPrior:
