@@ -317,10 +317,6 @@ def _image_side(name: str, value: Any) -> int | None:
 def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> PinholeCamera:
     if "matrix" not in table:
         raise CameraError(f"{where}: a camera needs `matrix` (3 x 3, pixels), got {sorted(table)}")
-    if ("rotation" in table) != ("translation" in table):
-        raise CameraError(
-            f"{where}: a pose needs `rotation` and `translation`, got {sorted(table)}"
-        )
     size = table.get("size", (None, None))
     try:
         if not isinstance(size, Sequence) or len(size) != 2:
@@ -329,13 +325,16 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
             raise CameraError(f"fisheye must be true or false, got {table['fisheye']!r:.60}")
         base = PinholeCamera.from_matrix(table["matrix"])
         fx, fy, skew, cx, cy = (float(e) for e in intrinsics(base.matrix))
-        return PinholeCamera(
+        camera = PinholeCamera(
             fx, fy, cx, cy, size[0], size[1], str(table.get("name", name)), skew=skew,
             distortions=table.get("distortions", ()),
             rotation=table.get("rotation", (0.0, 0.0, 0.0)),
             translation=table.get("translation", (0.0, 0.0, 0.0)),
             fisheye=bool(table.get("fisheye", False)),
         )  # fmt: skip
+        if ("rotation" in table) != ("translation" in table):
+            raise CameraError(f"a pose needs `rotation` and `translation`, got {sorted(table)}")
+        return camera
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
 
