@@ -212,7 +212,8 @@ def _by_number(
     if not one_kind or 2 * shared < min(lengths):
         return parts, (f"{said}; they are taken as simultaneous",)
     moved = [part.after(first - begin) for part, first in zip(parts, firsts, strict=True)]
-    return moved, (f"{said}; frames of one number are taken as simultaneous, 0 is number {begin}",)
+    counted = f", frame 0 is number {begin}" if begin else ""
+    return moved, (f"{said}; frames of one number are taken as simultaneous{counted}",)
 
 
 def _in_step(

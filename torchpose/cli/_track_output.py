@@ -147,7 +147,8 @@ def _sample_size(track: "PoseTrack") -> list[str]:
     size = size[size.isfinite().all(-1)]
     if not len(size):
         return []
-    kinds = {"pf": "particles", "window": "components"}
+    limbs = "directions of its limbs"
+    kinds = {"pf": "particles", "window": "components", "articulated": limbs, "multiple": limbs}
     kind = kinds.get(track.method.partition("-")[0], "tracks")
     left, right = size.quantile(0.5, 0).tolist()
     return [f"weight   on {left:.3g} (left arm) and {right:.3g} (right arm) {kind}, median"]
