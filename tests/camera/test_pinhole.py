@@ -330,9 +330,10 @@ def test_one_camera_needs_no_name(tmp_path):
         ("[metadata]\nerror = 0.0", FileFormatError, "none"),
         ("[cam]\nsize = [640, 480]", CameraError, r"\[cam\].*needs `matrix`"),
         (
-            "[cam]\nmatrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\nrotation = [0, 0, 0]",
+            "[a]\nmatrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\nrotation = [0, 0, 0]\n"
+            "[b]\nmatrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]",
             CameraError,
-            "needs `rotation` and `translation`",
+            "a pose is `rotation` and `translation`, and translation is not there",
         ),
         ("[cam]\nmatrix = [[0, 0, 1], [0, 1, 1], [0, 0, 1]]", CameraError, r"\[cam\].*focal"),
         ("[cam]\nmatrix = [[1, 0, 1], [0, 1, 1]]", CameraError, "shape"),

@@ -280,6 +280,18 @@ def test_keypoints_that_count_upwards_are_noted(track, files, tmp_path):
     assert "downwards" not in track()[0].out
 
 
+def test_guesses_outside_of_the_image_are_no_other_image(track, tmp_path):
+    clip = keypoints()
+    below = clip.keypoints[:, :1] + torch.tensor([0.0, 600.0])
+    guessed = below.expand(-1, 6, -1)
+    names = ("hip_left", "hip_right", "knee_left", "knee_right", "ankle_left", "ankle_right")
+    sure = torch.cat([torch.ones(N_FRAMES, 4), torch.full((N_FRAMES, 6), 0.1)], 1)
+    more = torch.cat([clip.keypoints, guessed], 1)
+    clip = replace(clip, keypoints=more, names=(*clip.names, *names), confidence=sure.double())
+    write_keypoints(tmp_path / "near.npz", clip)
+    assert bool(track(clip=tmp_path / "near.npz")[1].observed.any())
+
+
 def test_several_people_and_numbers_of_files_are_noted(track, files, tmp_path):
     clip = keypoints()
     rows = clip.keypoints.nan_to_num(0)
@@ -295,25 +307,12 @@ def test_several_people_and_numbers_of_files_are_noted(track, files, tmp_path):
     assert "frame 0 is number 100" in done.out
 
 
-def test_keypoints_of_no_body_have_no_poses(torchpose, files, tmp_path):
-    clip = keypoints()
-    clip.keypoints[...] = 640 * torch.rand(clip.keypoints.shape, dtype=torch.float64)
-    write_keypoints(
-        tmp_path / "noise.npz", replace(clip, K=torch.diag(torch.tensor([11.0, 11, 1])).double())
-    )
-    prior = files / "prior.safetensors"
-    done = torchpose(
-        "track",
-        tmp_path / "noise.npz",
-        "--out",
-        tmp_path / "out",
-        "--prior",
-        prior,
-        "--pictures",
-        "false",
-    )
-    assert done.code == 1
-    assert "no keypoint was taken for a measurement" in done.err
+def test_keypoints_of_no_body_have_no_poses(track, capsys):
+    poses = track()[1]
+    assert track_output.report_failure(poses) == 0
+    nothing = replace(poses, observed=torch.zeros_like(poses.observed))
+    assert track_output.report_failure(nothing) == 1
+    assert "no keypoint was taken for a measurement" in capsys.readouterr().err
 
 
 # --- refusals -------------------------------------------------------------------------------------

@@ -67,6 +67,13 @@ def test_coordinates_that_are_no_pixels(tmp_path):
     )  # too few to tell
 
 
+def test_peaks_above_one_count_as_one(tmp_path):
+    read = read_keypoints(
+        write(tmp_path / "a.npz", keypoints=points(), confidence=np.full((5, 3), 1.3))
+    )
+    assert read.confidence is not None and bool((read.confidence == 1).all())
+
+
 def test_zeros_are_missing(tmp_path):
     zeros = points()
     zeros[2, 1] = 0
@@ -112,6 +119,7 @@ def test_the_neck_of_a_known_set(tmp_path):
         ({"confidence": np.ones((5, 2))}, FileFormatError, "confidence"),
         ({"confidence": -np.ones((5, 3))}, FileFormatError, "at least 0"),
         ({"confidence": np.full((5, 3), math.inf)}, FileFormatError, "finite"),
+        ({"confidence": np.full((5, 3), 90.0)}, FileFormatError, "percent by 100"),
         ({"fps": -1.0}, FileFormatError, "fps"),
         ({"fps": [25.0, 30.0]}, FileFormatError, "fps"),
         ({"K": np.zeros((3, 3))}, CameraError, "focal"),

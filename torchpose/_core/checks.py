@@ -155,11 +155,15 @@ def check_positive(name: str, value: float) -> float:
 
 def check_height(height: float, name: str = "height") -> float:
     """Return the height of a person, or raise `InputError` unless it can be one in metres."""
-    if not isinstance(height, int | float) or not _SMALLEST <= height <= _TALLEST:
+    try:
+        metres = math.nan if isinstance(height, bool | str) else float(height)
+    except (TypeError, ValueError):
+        metres = math.nan
+    if not _SMALLEST <= metres <= _TALLEST:
         raise InputError(
             f"{name} must lie between {_SMALLEST} and {_TALLEST} m, got {height!r}; it is in metres"
         )
-    return float(height)
+    return metres
 
 
 def check_count(name: str, value: int) -> None:

@@ -242,7 +242,15 @@ def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, Pinho
     tables = {k: v for k, v in content.items() if isinstance(v, Mapping) and k != "metadata"}
     if not tables:
         raise FileFormatError(f"{path}: expected a table per camera with `matrix`, found none")
-    return {name: _camera_from_table(f"{path} [{name}]", name, t) for name, t in tables.items()}
+    found = {name: _camera_from_table(f"{path} [{name}]", name, t) for name, t in tables.items()}
+    if len(found) > 1:  # the poses of cameras of a rig count
+        for name, table in tables.items():
+            missing = [key for key in ("rotation", "translation") if key not in table]
+            if len(missing) == 1:
+                raise CameraError(
+                    f"{path} [{name}]: a pose is `rotation` and `translation`, and {missing[0]} is not there"
+                )
+    return found
 
 
 def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
@@ -325,16 +333,13 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
             raise CameraError(f"fisheye must be true or false, got {table['fisheye']!r:.60}")
         base = PinholeCamera.from_matrix(table["matrix"])
         fx, fy, skew, cx, cy = (float(e) for e in intrinsics(base.matrix))
-        camera = PinholeCamera(
+        return PinholeCamera(
             fx, fy, cx, cy, size[0], size[1], str(table.get("name", name)), skew=skew,
             distortions=table.get("distortions", ()),
             rotation=table.get("rotation", (0.0, 0.0, 0.0)),
             translation=table.get("translation", (0.0, 0.0, 0.0)),
             fisheye=bool(table.get("fisheye", False)),
         )  # fmt: skip
-        if ("rotation" in table) != ("translation" in table):
-            raise CameraError(f"a pose needs `rotation` and `translation`, got {sorted(table)}")
-        return camera
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
 

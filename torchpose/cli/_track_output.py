@@ -195,6 +195,6 @@ def person_suffix(place: int) -> str:
 
 def percent(share: float) -> str:
     """Return a share as a rounded percentage, which is 100 % only of all and 0 % only of none."""
-    if 0 < share < 0.0005:
+    if 0 < share < 0.001:
         return "below 0.1 %"
     return f"{min(100 * share, 99.9 if share < 1 else 100.0):.3g} %"

@@ -35,6 +35,7 @@ _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
 _NORMALISED = 2.0  # no more are shares of the image, in which joints may lie outside
 _SEVERAL = 6  # keypoints
+_MOST_CONFIDENCE = 2.0  # peaks of heat maps may exceed 1, and count as 1
 
 
 @dataclass
@@ -268,7 +269,12 @@ def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]
     if (confidence < 0).any() or np.isinf(confidence).any():
         bad = confidence[(confidence < 0) | np.isinf(confidence)][0]
         raise FileFormatError(f"{path}: confidences must be finite and at least 0, got {bad:g}")
-    return confidence
+    if confidence.max(initial=0.0) > _MOST_CONFIDENCE:
+        raise FileFormatError(
+            f"{path}: confidences must lie in [0, 1], got {confidence.max():g}; divide scores in percent "
+            "by 100"
+        )
+    return confidence.clip(max=1.0)
 
 
 def _check_matrix(path: Path, matrix: np.ndarray | None) -> Tensor | None:

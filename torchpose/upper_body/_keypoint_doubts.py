@@ -16,7 +16,9 @@ _TURNED = 0.8  # share of the frames in which what is above should not be below
 
 
 def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> None:
-    """Refuse keypoints most of which lie outside the image.
+    """Refuse keypoints most of which lie outside the image, each counted by its confidence.
+
+    Detectors also say where what they do not see would be, beyond the border of the image.
 
     Args:
         keypoints: of a file. size: (width, height) of the images, None if unknown.
@@ -26,13 +28,15 @@ def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> N
     """
     if size is None:
         return
-    points = keypoints.keypoints[keypoints.measured]
+    there = keypoints.measured
+    points, sure = keypoints.keypoints[there], keypoints.confidence
+    weights = torch.ones_like(points[:, 0]) if sure is None else sure[there].to(points)
     outside = ((points < 0) | (points > points.new_tensor(size))).any(-1)
-    if 2 * int(outside.sum()) > len(points):
+    if 2 * float(weights[outside].sum()) > float(weights.sum()):
         raise CameraError(
             f"{keypoints.path}: {int(outside.sum())} of {len(points)} keypoints lie outside the image of "
-            f"{size[0]} x {size[1]} pixels; if they are of a video of another size, give its camera and "
-            "image_size"
+            f"{size[0]} x {size[1]} pixels, most of those that are sure; if they are of a video of another "
+            "size, give its camera and image_size"
         )
 
 

@@ -15,6 +15,7 @@ _WARM_UP = 10  # frames that are discarded: exposure settles, and the rate is me
 _PATIENCE = 5  # reads without a frame, one after another, before a camera counts as unplugged
 _PAUSE = 0.02  # seconds between them
 _WRONG = 0.05  # share by which two rates may differ
+_PAUSES = 10.0  # times the usual time between frames, which is then a pause
 _TELLING = 2.0  # seconds of frames that tell at what rate they are read
 
 
@@ -114,17 +115,20 @@ class CameraSource(VideoSource):
     def _read(self) -> Iterator[VideoFrame]:
         import cv2
 
-        count, last = 0, 0.0
+        times: list[float] = []
+        due = 0.0  # seconds
         try:
             for image, seconds in self._images():
-                if seconds < count / self.fps - self._early:
+                if seconds < due - self._early:
                     continue
-                count, last = count + 1, seconds
-                yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, count - 1)
+                # after a pause frames are due from then on, and none is made up for
+                due = max(due, seconds - 1 / self.fps) + 1 / self.fps
+                times.append(seconds)
+                yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, len(times) - 1)
         finally:  # also if it is closed
-            self._note_rate(count, last)
+            self._note_rate(times)
         self.notes.append(
-            f"{self.name} gave no more frames after {count}: unplugged, or taken by another program"
+            f"{self.name} gave no more frames after {len(times)}: unplugged, or taken by another program"
         )
 
     def _images(self) -> Iterator[tuple[Any, float]]:
@@ -140,13 +144,17 @@ class CameraSource(VideoSource):
                 )
             yield image, now - start
 
-    def _note_rate(self, count: int, seconds: float) -> None:
-        """Add a note if frames were read at another rate than was assumed."""
-        if seconds < _TELLING:
+    def _note_rate(self, times: list[float]) -> None:
+        """Add a note if frames were read at another rate than was assumed, pauses apart."""
+        if not times or times[-1] < _TELLING:
             return
-        rate = (count - 1) / seconds
+        import numpy as np
+
+        gaps = np.diff(times)
+        usual = gaps[gaps <= _PAUSES * np.median(gaps)]
+        rate = len(usual) / usual.sum()
         if abs(rate / self.fps - 1) > _WRONG:
-            reached = f"{(1 - _WRONG) * rate:.2g}"
+            reached = f"{(1 - _WRONG) * rate:.3g}"
             self.notes.append(
                 f"{self.name} was read at {rate:.3g} frames per second and taken for one of {self.fps:.4g}: "
                 f"what was made of it moves {self.fps / rate:.2g} times as fast as in truth; ask for a rate "

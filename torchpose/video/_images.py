@@ -74,6 +74,7 @@ class FolderSource(VideoSource):
         self.folder, self._wanted = Path(folder), fps
         self._paths = find_images(folder)
         self.n_frames, self.fps = len(self._paths), fps or _DEFAULT_FPS
+        self.knows_rate = fps is not None
         if fps is None:
             self.notes.append(
                 f"images have no rate; {_DEFAULT_FPS:g} frames per second are assumed"

@@ -39,9 +39,11 @@ class VideoSource(abc.ABC):
         name: as given by the user. fps: frames per second. size: (width, height) of every frame, pixels.
         n_frames: estimated number of frames; None if unknown (a camera).
         notes: findings so far. reopenable: whether `reopen` works.
+        knows_rate: whether `fps` was stated, and not assumed.
     """
 
     reopenable = False
+    knows_rate = True
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -318,7 +318,7 @@ class VideoTracker(nn.Module):
 
     def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[Image]:
         """Return the images of frames, which may have more to them, once their rate is known to be `fps`."""
-        rate = getattr(frames, "fps", None)
+        rate = getattr(frames, "fps", None) if getattr(frames, "knows_rate", True) else None
         if rate and abs(rate / self.fps - 1) > _SAME_RATE:
             raise InputError(
                 f"the video has {rate:g} frames per second, and the tracker is for {self.fps:g}; "

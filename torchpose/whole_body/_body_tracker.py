@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_floating, check_rate, check_shape
+from torchpose._core.checks import check_rate, check_shape
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.moved import warn_of_former
@@ -314,7 +314,7 @@ class BodyTracker(nn.Module):
                 )
             if keypoints is None:
                 raise InputError(f"method {self.method} takes keypoints, got none")
-            check_floating("keypoints", keypoints)
+            _check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
             _refuse_given(
                 self.method, initial_state=initial_state, generator=generator, lengths=lengths,
                 facing=facing, n_frames=n_frames,
@@ -473,7 +473,7 @@ class BodyTracker(nn.Module):
             return self._tracked(state, self._by_particles.observed(shown, given)[0])
         if keypoints is None:
             raise InputError(f"method {self.method} takes keypoints, got none")
-        check_floating("keypoints", keypoints)
+        _check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         if (isinstance(state.filter, PeopleStream) != (persons is not None)) and state.filter:
@@ -567,6 +567,15 @@ def _refuse(unused: Sequence[str], where: str) -> None:
     """Raise `InputError` for arguments that the method does not use."""
     if unused:
         raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
+
+
+def _check_tensors(**values: object) -> None:
+    """Raise `InputError` for arrays and lists in place of tensors."""
+    for name, value in values.items():
+        if value is not None and not isinstance(value, Tensor):
+            raise InputError(
+                f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
+            )
 
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:

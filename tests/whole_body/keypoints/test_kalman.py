@@ -510,7 +510,7 @@ def test_names_of_a_stream_hold_for_all_frames(four):
 @pytest.mark.parametrize(
     ("changes", "error", "said"),
     [
-        ({"keypoints": lambda k: k.numpy()}, InputError, "floating-point tensor, got ndarray"),
+        ({"keypoints": lambda k: k.numpy()}, InputError, "must be a tensor, got ndarray"),
         ({"confidence": lambda c: 100 * c}, InputError, "divide scores in percent by 100"),
         ({"keypoints": lambda k: k.repeat(1, 1, 2, 1)}, ShapeError, "BODY_15, whose names count"),
     ],
@@ -520,6 +520,14 @@ def test_what_keypoints_are_is_said(four, changes, error, said):
     given = {name: changes.get(name, lambda v: v)(value) for name, value in given.items()}
     with pytest.raises(error, match=said):
         tracker(four.rig)(**given)
+
+
+def test_peaks_of_heat_maps_count_as_one(four):
+    plain, peaks = (
+        tracker(four.rig)(keypoints=four.keypoints[:4], confidence=torch.full((4, 4, 15), value))
+        for value in (1.0, 1.02)
+    )
+    torch.testing.assert_close(peaks.joints3d, plain.joints3d, rtol=0, atol=0)
 
 
 def test_a_height_in_centimetres_and_no_state_are_refused(four):

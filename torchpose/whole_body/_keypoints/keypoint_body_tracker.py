@@ -1,5 +1,6 @@
 """Track one person or several recordings through keypoints of calibrated cameras, to `BodyTrack`."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,7 +11,6 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import (
     check_choice,
-    check_floating,
     check_height,
     check_positive,
     check_shape,
@@ -54,6 +54,9 @@ INLIER = (0.05, 0.97)
 """Least and largest prior probability that a keypoint is its joint's."""
 PIXEL_STD = 1.0
 """Pixels, how far keypoints are from projected joints, beside what they are off in space."""
+_MOST_CONFIDENCE = (
+    2.0  # peaks of heat maps may exceed 1, which then counts; percentages are refused
+)
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
@@ -194,8 +197,11 @@ class KeypointBodyTracker(nn.Module):
         former = self.tracker.filter
 
         def track(rig: CameraRig, moved: KeypointFrame, smooth: bool) -> KeypointPoses:
-            tracker = KeypointTracker(rig, self.fps, former.motion, upright=former.upright)
-            return tracker(moved.map(lambda value: value[None]), smooth, progress)
+            tracker = KeypointTracker(
+                rig, self.fps, former.motion, upright=former.upright, lone=self.tracker.lone
+            )
+            # the frames are those from the first one on that may begin: it has waited already
+            return tracker(moved.map(lambda value: value[None]), smooth, progress, waited=math.inf)
 
         single = frames.map(lambda value: value[0])
         found = refine_cameras(
@@ -222,18 +228,18 @@ class KeypointBodyTracker(nn.Module):
         shape = keypoints.shape[:-1]
         for name, value in (("confidence", confidence), ("covariance", covariance)):
             if value is not None:
-                check_floating(name, value)
                 check_shape(name, value, list(shape))
         points = keypoints.to(self.rig.matrix)
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
         trust = trust.nan_to_num(0.0)
         known = torch.isfinite(points).all(-1)
-        outside = known & ((trust < 0) | (trust > 1))
+        outside = known & ((trust < 0) | (trust > _MOST_CONFIDENCE))
         if bool(outside.any()):
             raise InputError(
                 f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "
                 "divide scores in percent by 100"
             )
+        trust = trust.clamp(0.0, 1.0)
         there = known & (trust > 0)
         own = self.pixel_std**2 * torch.ones_like(trust)
         relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
@@ -306,7 +312,8 @@ class KeypointBodyTracker(nn.Module):
         first_frame: int = 0,
     ) -> BodyTrack:
         """Return the track of one element of the batch, from the frame on in which it begins."""
-        begun = int(poses.started[b].int().argmax())
+        live = poses.started.shape[1] == 1
+        begun = 0 if live else int(poses.started[b].int().argmax())
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
         first_frame += begun
         body = self.tracker.filter.articulation
@@ -379,7 +386,8 @@ def _rigid_body(bones: Float[Tensor, "T J 3"], measured: Bool[Tensor, " T"]) -> 
 
     Frames without a measurement count where there are no others.
     """
-    bones = bones[measured] if bool(measured.any()) else bones
+    if len(bones) > 1 and bool(measured.any()):
+        bones = bones[measured]
     middle = bones.median(0).values
     middle[0] = 0
     lengths = middle.norm(dim=-1)

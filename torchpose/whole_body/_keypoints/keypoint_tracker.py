@@ -38,9 +38,7 @@ from torchpose.whole_body._keypoints.upright import Upright, camera_up
 __all__ = ["LEAST_JOINTS", "KeypointPoses", "KeypointStream", "KeypointTracker", "stacked"]
 
 LEAST_JOINTS = 6  # that are measured where tracking begins
-_PATIENCE = (
-    0.5  # seconds that a start waits for a second camera, without which it guesses the distance
-)
+_PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 
