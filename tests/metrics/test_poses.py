@@ -124,6 +124,17 @@ def test_errors_and_their_summary_leave_out_what_is_missing() -> None:
     assert count.tolist() == [1, 2]
 
 
+def test_what_is_missing_has_no_gradient() -> None:
+    truth = torch.rand(4, 8, 3, dtype=torch.float64)
+    truth[0, 2], mask = torch.nan, torch.ones(4, 8, dtype=torch.bool)
+    mask[1] = False
+    estimate = torch.rand(4, 8, 3, dtype=torch.float64, requires_grad=True)
+    metrics.joint_errors(estimate, truth, mask=mask).nanmean().backward()
+    assert estimate.grad is not None and bool(estimate.grad.isfinite().all())
+    assert not estimate.grad[1].any() and not estimate.grad[0, 2].any()
+    assert bool((estimate.grad[2] != 0).all())
+
+
 def test_jitter_of_known_motions() -> None:
     time = torch.arange(31, dtype=torch.float64)[:, None, None] / 30
     steady = torch.cat([2 * time, time, 0 * time], -1)

@@ -159,6 +159,15 @@ def test_state_dict_round_trip():
     assert float(other.log_prob(x)) == float(mixture.log_prob(x))
 
 
+def test_weights_that_are_a_parameter_are_refused():
+    given = (torch.tensor([[0.0], [1.0]]), torch.ones(2, 1, 1))
+    with pytest.raises(InputError, match=r"logits\.softmax"):
+        GaussianMixture(torch.nn.Parameter(torch.tensor([0.5, 0.5])), *given)
+    logits = torch.nn.Parameter(torch.zeros(2))
+    GaussianMixture(logits.softmax(-1), *given).log_prob(torch.zeros(1)).backward()
+    assert logits.grad is not None and bool((logits.grad != 0).all())
+
+
 def test_weights_are_normalised_up_to_rounding_only():
     given = random_mixture()
     weights = given.weights * (1 + 1e-9)

@@ -279,6 +279,12 @@ def test_forward_of_an_estimator_is_its_advance(prior, keypoints, method, capsys
         assert ("frame" in capsys.readouterr().err) is (n == 30)  # the bar
 
 
+def test_what_is_no_method_is_not_registered():
+    with pytest.raises(InputError, match="a subclass of Estimator or a PoseFilter, got 3"):
+        register_method("three", 3)
+    assert "three" not in METHODS
+
+
 def test_windows_that_are_named_and_denied_are_refused(prior):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)

@@ -145,6 +145,16 @@ def test_smoothed_odds_rest_on_what_was_predicted_before_and_after(prior):
     torch.testing.assert_close(smoothed, expected, atol=1e-6, rtol=0)
 
 
+def test_a_lag_that_reaches_the_end_is_full_smoothing(prior, of_performer):
+    full, longer, short = (
+        tracked(prior, of_performer, "multiple-model", KEYPOINT_NAMES, demo_camera(), smoothing=lag)
+        for lag in ("full", 100, 20)
+    )
+    torch.testing.assert_close(longer.joints3d, full.joints3d, rtol=0, atol=1e-9)
+    last = short.joints3d[:, -1:], full.joints3d[:, -1:]
+    torch.testing.assert_close(*last, rtol=0, atol=0.02)
+
+
 def test_frames_without_arms_leave_the_odds(prior):
     keypoints = of_stranger(30)
     keypoints[:, 10:, 2:] = torch.nan

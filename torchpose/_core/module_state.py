@@ -15,6 +15,7 @@ from torchpose.errors import InputError
 __all__ = [
     "WideModule",
     "derived",
+    "in_own_precision",
     "one_run",
     "outside_inference",
     "register_given",
@@ -216,13 +217,18 @@ class WideModule(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = fn(torch.zeros(1, dtype=self.dtype)).dtype
         self.dtype = working_precision("dtype", wanted)
+        return super()._apply(in_own_precision(fn), recurse)
 
-        def moved(tensor: Tensor) -> Tensor:
-            result = fn(tensor)
-            changed = tensor.is_floating_point() and result.dtype != tensor.dtype
-            return tensor.to(result.device) if changed else result
 
-        return super()._apply(moved, recurse)
+def in_own_precision(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """Return a function for `Module._apply` that moves tensors as `fn` does and leaves their precision."""
+
+    def moved(tensor: Tensor) -> Tensor:
+        result = fn(tensor)
+        changed = tensor.is_floating_point() and result.dtype != tensor.dtype
+        return tensor.to(result.device) if changed else result
+
+    return moved
 
 
 def working_precision(name: str, dtype: torch.dtype) -> torch.dtype:

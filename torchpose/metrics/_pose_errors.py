@@ -135,8 +135,13 @@ def joint_errors(
         averaged with `summarise_errors`, which leaves those out and counts the others.
     """
     estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
-    errors = torch.linalg.vector_norm(estimate - truth, dim=-1)
-    return errors if mask is None else errors.masked_fill(~mask, math.nan)
+    apart = estimate - truth
+    missing = apart.isnan().any(-1)
+    if mask is not None:
+        missing = missing | ~mask
+    # what is missing is left out before the norm, through which its NaN would reach gradients
+    errors = torch.linalg.vector_norm(apart.masked_fill(missing[..., None], 0.0), dim=-1)
+    return errors.masked_fill(missing, math.nan)
 
 
 def joint_errors_2d(

@@ -98,7 +98,7 @@ class GaussianMixture(nn.Module):
 
     Raises:
         ShapeError: sizes do not fit together.
-        InputError: weights that are not positive or do not sum to one, values not finite.
+        InputError: weights that are a parameter, are not positive or do not sum to one, values not finite.
         CovarianceError: a covariance that is not symmetric or not positive definite.
 
     Reference:
@@ -122,6 +122,11 @@ class GaussianMixture(nn.Module):
         covariances: Float[Tensor, "K D D"],
     ) -> None:
         super().__init__()
+        if isinstance(weights, nn.Parameter):
+            raise InputError(
+                "weights must not be a parameter, which a step of an optimiser would not keep positive and "
+                "summing to one; pass logits.softmax(-1) of a parameter of your own"
+            )
         _check_mixture(weights, means, covariances)
         register_given(self, "weights", weights / weights.sum())
         register_given(self, "means", means)

@@ -95,8 +95,14 @@ def register_method(name: str, method: Method) -> None:
             `PoseFilter`; its options are those of its signature.
 
     Raises:
-        InputError: another method has this name.
+        InputError: another method has this name, or it is no method.
     """
+    estimator = isinstance(method, type) and issubclass(method, Estimator)
+    if not (estimator or isinstance(method, PoseFilter)):
+        raise InputError(
+            f"a method must be a subclass of Estimator or a PoseFilter, got {method!r:.80}; "
+            "docs/adding-a-tracker.md shows both"
+        )
     add_method(METHODS, name, method)
 
 
@@ -230,8 +236,8 @@ def choose_method(
         InputError: no such method, one that cannot do what was asked for, an option that it does not
             use, or a smoothing that is none.
     """
-    wrong_lag = isinstance(smoothing, int) and smoothing < 0
-    if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
+    lag = isinstance(smoothing, int) and not isinstance(smoothing, bool) and smoothing >= 0
+    if not (smoothing is None or lag or smoothing == "full"):
         raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")
     free = method is None and not windows and not list(options)
     chosen = Chosen(method, ()) if method else _default(prior, smoothing, fps, options, free)

@@ -143,9 +143,9 @@ class MultipleModelFilter(Estimator):
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`.
 
-        With smoothing "full" the log-odds are those of the frames before and after. Windows with later frames
-        in them are surer of persons whom they do not know, and not better. So their evidence is that of the
-        windows that end with the frame, and their poses are averaged with those of these.
+        The log-odds are those of the frames before and of the later ones that smoothing uses. Windows with
+        later frames in them are surer of persons whom they do not know, and not better. So their evidence is
+        that of the windows that end with the frame, and their poses are averaged with those of these.
         """
         if self.model.smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
@@ -162,8 +162,7 @@ class MultipleModelFilter(Estimator):
             ratios = ratios * (frames < lengths.to(ratios.device)[:, None])[..., None]
         none = ratios.new_zeros(len(ratios), 2)
         sums = self._sums(none, ratios)
-        if self.model.smoothing == "full":
-            sums = sums + self._sums(none, ratios.flip(1)).flip(1) - ratios
+        sums = sums + self._later_sums(ratios) - ratios
         return repeat_last(self._mixed(sums, reading, seen, bodies, measured), lengths)
 
     def _steadied(self, seen: Estimates, lengths: Tensor | None) -> ReadOut:
@@ -190,6 +189,16 @@ class MultipleModelFilter(Estimator):
             before = self.forget * before + now
             sums.append(before)
         return torch.stack(sums, 1)
+
+    def _later_sums(self, ratios: Float[Tensor, "B T 2"]) -> Float[Tensor, "B T 2"]:
+        """Return the discounted sums of each frame and of the later ones that smoothing uses."""
+        later = self._sums(torch.zeros_like(ratios[:, 0]), ratios.flip(1)).flip(1)
+        lag = self.model.smoothing
+        if not isinstance(lag, int) or lag + 1 >= ratios.shape[1]:
+            return later
+        beyond = torch.zeros_like(later)
+        beyond[:, : -lag - 1] = self.forget ** (lag + 1) * later[:, lag + 1 :]
+        return later - beyond
 
     def _mixed(
         self,

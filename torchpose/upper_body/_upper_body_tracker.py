@@ -7,7 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_count, check_floating, check_shape, refuse_export
+from torchpose._core.checks import (
+    check_choice,
+    check_count,
+    check_floating,
+    check_shape,
+    refuse_export,
+)
 from torchpose._core.module_state import (
     WideModule,
     derived,
@@ -21,6 +27,7 @@ from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._upper_body import NECK_KINDS
 from torchpose.upper_body._absence import HANDS, absence_of
 from torchpose.upper_body._estimator import (
     Estimator,
@@ -122,8 +129,8 @@ class UpperBodyTracker(WideModule):
             out of "multiple-model" too.
         calibrated: whether `covariance3d` is recalibrated by factors that the prior's training persons
             showed, if the prior has them.
-        neck: the kind of neck of the keypoints, where their names do not tell it (see
-            `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
+        neck: the kind of neck of the keypoints, where their names do not tell it: "neck", "low-neck" or
+            "mid-shoulder". A neck of another kind than the prior's is put where the
             prior has it, between the middle of the shoulders and the head, or else not measured.
         max_gap: the longest time without any keypoint, seconds; None for no bound.
         outliers: whether keypoints that belong to no body count as missing, and exchanged hands are
@@ -179,6 +186,8 @@ class UpperBodyTracker(WideModule):
         self.calibrated = calibrated
         self.frame = frame
         self.static_camera = static_camera
+        if neck is not None:
+            check_choice("neck", neck, NECK_KINDS)
         self.neck = neck
         self.max_gap = max_gap
         self.outliers = outliers

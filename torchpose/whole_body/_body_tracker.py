@@ -1,9 +1,9 @@
 """Track whole bodies: from keypoints or silhouettes in calibrated cameras to the poses of one person."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack, overload
+from typing import Any, NamedTuple, Self, Unpack, overload
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_rate, check_shape
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
+from torchpose._core.module_state import in_own_precision
 from torchpose._core.moved import warn_of_former
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
@@ -245,6 +246,10 @@ class BodyTracker(nn.Module):
         """Return the square root of `initial_cov`; deprecated."""
         warn_of_former("BodyTracker.initial_std is the root of initial_cov; it goes")
         return self.initial_cov.sqrt()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the tensors, as `to` asks for, and keep their precision: that of filters is double."""
+        return super()._apply(in_own_precision(fn), recurse)
 
     @takes_former_arguments
     @torch.no_grad()

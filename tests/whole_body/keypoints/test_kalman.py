@@ -530,6 +530,13 @@ def test_peaks_of_heat_maps_count_as_one(four):
     torch.testing.assert_close(peaks.joints3d, plain.joints3d, rtol=0, atol=0)
 
 
+def test_single_precision_leaves_the_filter_double(four):
+    plain = tracker(four.rig)(keypoints=four.keypoints[:4], confidence=four.confidence[:4])
+    module = torch.nn.Sequential(tracker(four.rig)).float()
+    same = module[0](keypoints=four.keypoints[:4], confidence=four.confidence[:4])
+    torch.testing.assert_close(same.joints3d, plain.joints3d, rtol=0, atol=0)
+
+
 def test_a_height_in_centimetres_and_no_state_are_refused(four):
     with pytest.raises(InputError, match=r"height must lie between 0\.5 and 2\.6 m, got 175"):
         tracker(four.rig, height=175)
