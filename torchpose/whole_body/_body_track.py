@@ -217,7 +217,7 @@ class BodyTrack:
             )
 
     def joints_std(self) -> Tensor:
-        """Return the standard deviation of every joint [T, J], metres, the mean of the three axes."""
+        """Return the standard deviation of every joint [T, J], metres: of an axis, by the mean variance."""
         variance = self.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1)
         return variance.clamp_min(0).sqrt()
 
