@@ -99,6 +99,14 @@ def test_the_page_holds_the_poses(tmp_path):
     assert data["names"][0] == "left hand" and data["sides"][7] == "right"
 
 
+def test_names_of_a_whole_body_begin_with_the_side_too(tmp_path):
+    names = ("left_wrist", "right_upper_arm", "neck", "knee_left", "mid_hip", "a", "b", "c")
+    write_report(tmp_path / "a.html", [replace(track_of(2), names=names)])
+    data = read(tmp_path / "a.html").data
+    assert data["names"][:5] == ["left wrist", "right upper arm", "neck", "left knee", "mid hip"]
+    assert data["sides"][:5] == ["left", "right", "middle", "left", "middle"]
+
+
 def test_it_needs_no_network(tmp_path):
     write_report(tmp_path / "a.html", [track_of()], facts={"prior": "x"}, notes=["y"])
     text = (tmp_path / "a.html").read_text()

@@ -165,13 +165,13 @@ def side_of(name: str) -> str:
 
 
 def readable(name: str) -> str:
-    """Return a joint's name in words, ``hand_left`` as ``left hand``.
+    """Return a joint's name in words, its side first: ``hand_left`` as ``left hand``.
 
-    >>> readable("hand_left")
-    'left hand'
+    >>> readable("hand_left"), readable("left_wrist"), readable("right_upper_arm")
+    ('left hand', 'left wrist', 'right upper arm')
     """
-    stem, _, side = name.rpartition("_")
-    return f"{side} {stem}" if stem else name
+    side = side_of(name)
+    return " ".join(sorted(name.split("_"), key=lambda word: word != side))
 
 
 def join_unit(label: str, unit: str) -> str:
