@@ -45,6 +45,7 @@ from torchpose.whole_body._filters.body_particles import (
     best_particle,
     resample_state,
     stack_outputs,
+    without_repeats,
 )
 from torchpose.whole_body._filters.hooks import BodyFilterHooks
 from torchpose.whole_body._filters.legs import check_leg_swap, extra_copies, swap_legs
@@ -290,7 +291,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
             state, out = self.filter_frame(state, shown, cameras, generator)
             steps.append(out)
         track = stack_outputs(steps, lengths)
-        self.warn(track)
+        self.warn(without_repeats(track, lengths))
         return state, track
 
     def filter_frame(
