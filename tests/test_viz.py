@@ -13,6 +13,7 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 from torchpose import demo, metrics, viz
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
 from torchpose.viz import _style as style
+from torchpose.viz._body_picture import plot_body_strip
 from torchpose.viz._charts import _spans
 
 
@@ -95,6 +96,20 @@ def test_labels_carry_units_and_legends_stay_out_of_the_data(pictures) -> None:
             assert box.x0 >= 0 and box.x1 <= figure.bbox.x1
 
 
+def test_a_narrow_figure_becomes_as_wide_as_its_title_and_legend(scene) -> None:
+    title = "The tracked pose of a person"
+    for words in (title, None):
+        figure = viz.plot_pose_strip(
+            scene.joints[:1], observed=scene.observed[:1], truth=scene.truth[:1], title=words
+        )
+        figure.canvas.draw()
+        texts = [*figure.legends[0].get_texts(), *([figure._suptitle] if words else [])]
+        for box in (text.get_window_extent() for text in texts):
+            assert box.x0 >= 0 and box.x1 <= figure.bbox.x1
+    assert style.new_figure(9.2, 2.0, title).get_figwidth() == 9.2
+    assert style.new_figure(1.0, 2.0).get_figwidth() == 1.0
+
+
 def test_curves_show_the_band_and_the_gap(scene) -> None:
     figure = viz.plot_joint_curves(
         scene.joints, scene.covariance, scene.observed, show=("hand_right", "elbow_left")
@@ -168,6 +183,15 @@ def test_bad_input_is_named(scene) -> None:
         viz.plot_pose_strip(torch.zeros(5, 7, 3))
     with pytest.raises(InputError, match="indices below 120"):
         viz.plot_pose_strip(scene.joints, frames=[120])
+    for joints, n_frames in ((scene.joints, 0), (scene.joints, -1), (scene.joints[:0], 8)):
+        with pytest.raises(InputError, match="at least"):
+            viz.plot_pose_strip(joints, n_frames=n_frames)
+        with pytest.raises(InputError, match="at least"):
+            plot_body_strip(joints.repeat(1, 2, 1)[:, :15], n_frames=n_frames)
+    with pytest.raises(InputError, match="at least one frame"):
+        viz.plot_error_bars({"a": torch.zeros(0, 8)})
+    with pytest.raises(ShapeError, match=r"joints must be \[T, 8, 2\]"):
+        viz.plot_joint_curves(torch.zeros(5, 8, 4))
     with pytest.raises(InputError, match="expected names among"):
         viz.plot_joint_curves(scene.joints, show=["foot"])
     with pytest.raises(InputError, match="at least one"):

@@ -105,6 +105,7 @@ def test_refusals(torchpose, shipped, tmp_path):
         (("--seconds", 0), "from 1 to 3600"),
         (("--input", "radio"), "video, keypoints"),
         (("--prior", "nobody"), "kinect-upper-body"),
+        (("--input", "walk", "--prior", "nobody"), "--prior is for the performer"),
         (("--out", tmp_path / "weights" / "kinect-upper-body.safetensors"), "cannot be written"),
     ):
         done = torchpose("demo", "--out", tmp_path / "out", *options)

@@ -42,7 +42,10 @@ def test_poses(torchpose, files, tmp_path):
     assert done.code == 0
     assert "45 (1.5 s at 30 fps)" in done.out
     row = next(line for line in done.out.splitlines() if line.startswith("hand_right"))
-    assert row.split()[1] == "88.9"
+    with np.load(tmp_path / "poses.npz") as poses:
+        variance = np.einsum("tii->t", poses["covariance3d"][:, 7]) / 3
+    assert row.split() == ["hand_right", "88.9", "%", f"{100 * np.sqrt(variance).mean():.1f}"]
+    assert "std per axis (cm)" in done.out
 
 
 def test_keypoints(torchpose, files, tmp_path):
@@ -109,7 +112,7 @@ def test_poses_of_a_whole_body(torchpose, tmp_path):
     done = torchpose("info", tmp_path / "body.npz")
     assert done.code == 0, done.err
     for part in ("4 (0.2 s at 25 fps) from frame 3", "1.70 m, rotations against the root",
-                 "bend 3-5, none 6-6", "left_wrist 17.3", "a note"):  # fmt: skip
+                 "bend 3-5, none 6-6", "std per axis (cm)", "left_wrist 10.0", "a note"):  # fmt: skip
         assert part in done.out, part
 
 

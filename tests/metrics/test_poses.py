@@ -117,6 +117,7 @@ def test_errors_and_their_summary_leave_out_what_is_missing() -> None:
     assert summary.per_joint.tolist() == [5.0, 2.0]
     assert summary.std.tolist() == [0.0, 1.0]
     assert summary.counts.tolist() == [1, 2]
+    assert summary.median.tolist() == [5.0, 2.0]
     mask = torch.tensor([[True, True], [True, False]])
     assert metrics.summarise_errors(metrics.joint_errors(estimate, truth, mask)).mean == 3.0
     share, count = share_below(errors, 2.0)
@@ -133,6 +134,21 @@ def test_what_is_missing_has_no_gradient() -> None:
     assert estimate.grad is not None and bool(estimate.grad.isfinite().all())
     assert not estimate.grad[1].any() and not estimate.grad[0, 2].any()
     assert bool((estimate.grad[2] != 0).all())
+
+
+@pytest.mark.parametrize("n_frames", [1, 6, 7])
+def test_the_median_is_that_of_numpy_and_infinite_errors_count(n_frames: int) -> None:
+    errors = normal(n_frames, 5).abs()
+    errors[0, 1] = errors[:, 4] = math.nan
+    errors[-1, 2] = math.inf
+    summary = metrics.summarise_errors(errors)
+    expected = [
+        np.median(column[~np.isnan(column)]) if not np.isnan(column).all() else math.nan
+        for column in errors.T.numpy()
+    ]
+    np.testing.assert_array_equal(summary.median.numpy(), expected)
+    assert summary.counts.tolist() == [n_frames, n_frames - 1, n_frames, n_frames, 0]
+    assert summary.per_joint[2] == math.inf
 
 
 def test_jitter_of_known_motions() -> None:

@@ -1,6 +1,7 @@
 """Limb conditionals against SciPy's rotations and synthetic walks, and knees of recorded walkers."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -197,6 +198,23 @@ def test_a_file_and_a_state_dict_bring_it_back(conditionals, tmp_path):
     torch.testing.assert_close(ours[0].double(), expected[0], atol=1e-3, rtol=0)
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(FileFormatError, match="limb-conditionals"):
+        LimbConditionals.load(path)
+
+
+def test_a_file_keeps_the_directions_of_sigma_points(conditionals, tmp_path):
+    path, tensors = tmp_path / "limbs.safetensors", conditionals._tensors()
+    cholesky = LimbConditionals(conditionals.info, **tensors, directions="cholesky")
+    cholesky.save(path)
+    loaded = LimbConditionals.load(path)
+    assert loaded.directions == "cholesky" and loaded.info == conditionals.info
+    conditionals.save(path)
+    assert LimbConditionals.load(path).directions == "eigen"
+    with pytest.raises(InputError, match="directions must be one of eigen, cholesky"):
+        LimbConditionals(conditionals.info, **tensors, directions="other")
+    extra = {"sigma_point_directions": ["eigen"]}
+    other = LimbConditionals(replace(conditionals.info, extra=extra), **tensors)
+    other.save(path)
+    with pytest.raises(FileFormatError, match="sigma_point_directions must be one of"):
         LimbConditionals.load(path)
 
 

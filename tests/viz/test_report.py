@@ -99,6 +99,14 @@ def test_the_page_holds_the_poses(tmp_path):
     assert data["names"][0] == "left hand" and data["sides"][7] == "right"
 
 
+def test_names_of_a_whole_body_begin_with_the_side_too(tmp_path):
+    names = ("left_wrist", "right_upper_arm", "neck", "knee_left", "mid_hip", "a", "b", "c")
+    write_report(tmp_path / "a.html", [replace(track_of(2), names=names)])
+    data = read(tmp_path / "a.html").data
+    assert data["names"][:5] == ["left wrist", "right upper arm", "neck", "left knee", "mid hip"]
+    assert data["sides"][:5] == ["left", "right", "middle", "left", "middle"]
+
+
 def test_it_needs_no_network(tmp_path):
     write_report(tmp_path / "a.html", [track_of()], facts={"prior": "x"}, notes=["y"])
     text = (tmp_path / "a.html").read_text()
@@ -262,6 +270,36 @@ def test_the_templates_are_part_of_the_package():
     assert UPPER_BODY[0] not in template
 
 
+_VALUES = """
+const elements = {};
+const document = { getElementById(id) {
+  return elements[id] ??= { textContent: id === "data" ? process.argv[2] : "" };
+} };
+const getComputedStyle = () => ({ getPropertyValue: () => "" });
+SCRIPTS
+writeValues();
+console.log($("curve-values").textContent);
+"""
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, 0.0])
+def test_a_joint_of_unknown_deviation_is_shown_with_a_question_mark(tmp_path, value):
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not on the PATH")
+    track = track_of(3)
+    track.covariance3d[:] = value
+    data = read(write_report(tmp_path / "a.html", [track])).by_id["data"]
+    scripts = [files("torchpose.viz._report").joinpath(name).read_text(encoding="utf-8")
+               for name in ("numbers.js", "plots.js", "player.js")]  # fmt: skip
+    code = _VALUES.replace("SCRIPTS", "\n".join(scripts).replace("\nsetUp();\n", "\n"))
+    (tmp_path / "values.js").write_text(code, encoding="utf-8")
+    command = [node, str(tmp_path / "values.js"), data]
+    run = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=60)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.count("± ?" if value else "± 0.0") == 3, run.stdout
+
+
 _PROBE = """<script>
 const out = document.body.dataset;
 window.addEventListener("error", (event) => { out.error = event.message; });
@@ -281,7 +319,7 @@ out.drawn = String(pixels.some((value) => value > 0));
 </script></body>"""
 
 
-@pytest.mark.parametrize("kind", ["plain", "long", "nan", "one frame", "nobody"])
+@pytest.mark.parametrize("kind", ["plain", "long", "nan", "unsure", "one frame", "nobody"])
 def test_a_browser_runs_it_without_an_error(tmp_path, monkeypatch, kind):
     chromium = shutil.which("chromium")
     if chromium is None:
@@ -294,6 +332,8 @@ def test_a_browser_runs_it_without_an_error(tmp_path, monkeypatch, kind):
         people[0].joints3d[0, 4:] = torch.nan
         people[0].covariance3d[0, 4:] = torch.nan
         people.append(track_of(5))
+    if kind == "unsure":
+        people[0].covariance3d[:] = torch.inf
     truth = performer(n_frames=20).joints if kind in ("plain", "long") else None
     path = write_report(tmp_path / "a.html", people, truth=truth, title=HOSTILE)
     path.write_text(path.read_text().replace("</body>", _PROBE))

@@ -74,6 +74,9 @@ def test_details_are_saved_by_their_names(tmp_path):
     np.savez(tmp_path / "short.npz", **(arrays | {"detail_released": np.zeros(3, dtype=bool)}))
     with pytest.raises(FileFormatError, match="detail_released of 4 frames"):
         BodyTrack.load(tmp_path / "short.npz")
+    np.savez(tmp_path / "inlier.npz", **(arrays | {"detail_inlier": np.zeros((4, 2, 8))}))
+    with pytest.raises(FileFormatError, match="detail_inlier of cameras and 15 joints"):
+        BodyTrack.load(tmp_path / "inlier.npz")
     # files of before there were details
     old = {k: v for k, v in arrays.items() if not k.startswith(("detail_", "action_names"))}
     np.savez(tmp_path / "old.npz", **old)
@@ -97,6 +100,19 @@ def test_joints_in_the_axes_of_a_camera():
     assert seen.observed.shape == (1, 4, 15)
     assert not seen.observed[0, 1].any()
     assert seen.observed[0, 0].all()
+
+
+def test_joints_are_observed_where_a_camera_has_their_keypoint():
+    track = poses()
+    inlier = torch.ones(4, 2, 15)
+    inlier[:, :, 3] = 0.0  # never detected
+    inlier[2, :, 4] = torch.tensor([0.4, 0.9])  # by one of both cameras
+    inlier[3, :, 4] = 0.3  # detections of something else
+    track.details["inlier"] = inlier
+    expected = torch.ones(4, 15, dtype=torch.bool)
+    expected[1] = expected[:, 3] = expected[3, 4] = False
+    camera = PinholeCamera(500, 500, 320, 240, 640, 480, rotation=(0, 0, 0), translation=(0, 0, 3))
+    assert torch.equal(track.seen_by(camera).observed[0], expected)
 
 
 def test_other_files_are_refused(tmp_path):

@@ -43,7 +43,7 @@ def run(
     Args:
         out: folder of the results.
         input: what is tracked (default video; needs matplotlib for the performer's face).
-        prior: a prior that comes with torchpose, or a .safetensors file.
+        prior: a prior that comes with torchpose, or a .safetensors file; not for the walk.
         seed: seed of the performance and its noise.
         seconds: length; the performance takes 20 s and starts over (default 20; of the walk 2.5).
         pictures: draw pictures.
@@ -59,6 +59,7 @@ def run(
     if input == "walk":
         from torchpose.cli._demo_walk import demo_walk
 
+        given.refuse(("prior",), "the performer, and --input walk is tracked with a manifold")
         return demo_walk(out, seconds, seed, pictures_possible(pictures))
     from torchpose.cli._demo_keypoints import demo_keypoints
     from torchpose.cli._demo_video import demo_video

@@ -155,11 +155,11 @@ def describe_prior(prior: "UpperBodyPrior") -> str:
 
 
 def describe_poses(path: Path) -> str:
-    """Return the frames, shares, uncertainty and notes of a file of poses."""
+    """Return the frames, shares, uncertainty (as `BodyTrack.joints_std`) and notes of a file of poses."""
     from torchpose.upper_body._pose_track import PoseTrack
 
     track = PoseTrack.load(path)
-    std = track.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt()
+    std = track.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(0).sqrt()
     n_frames = track.joints3d.shape[1]
     facts = {
         "poses": str(path),
@@ -173,11 +173,11 @@ def describe_poses(path: Path) -> str:
         "failed at": ", ".join(str(int(i)) for i in track.failed_at if i >= 0),
         "notes": "; ".join(track.notes),
     }
-    rows = ["joint            measured   std (cm)"]
+    rows = ["joint            measured   std per axis (cm)"]
     shares = track.observed.double().mean((0, 1)).tolist()
     spreads = std.nanmean((0, 1)).tolist()
     for name, share, spread in zip(track.names, shares, spreads, strict=True):
-        rows.append(f"{name:<16}{100 * share:>7.1f} %{100 * spread:>11.1f}")
+        rows.append(f"{name:<16}{100 * share:>7.1f} %{100 * spread:>20.1f}")
     return _table(facts) + "\n\n" + "\n".join(rows)
 
 

@@ -166,8 +166,8 @@ def describe_body_poses(path: Path) -> Facts:
     from torchpose.whole_body._body_track import BodyTrack
 
     poses = BodyTrack.load(path)
-    spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt().mean(0)
-    stds = zip(poses.names, (100 * spread).tolist(), strict=True)
+    spread = 100 * poses.joints_std().mean(0)
+    stds = zip(poses.names, spread.tolist(), strict=True)
     rate = (
         "rate unknown" if not poses.fps else f"{len(poses) / poses.fps:.1f} s at {poses.fps:g} fps"
     )
@@ -180,7 +180,7 @@ def describe_body_poses(path: Path) -> Facts:
         "lost": f"{int(poses.respread.sum())} frames" if bool(poses.respread.any()) else "",
         "details": ", ".join(poses.details),
         "actions": action_text(poses),
-        "std (cm)": ", ".join(f"{name} {value:.1f}" for name, value in stds),
+        "std per axis (cm)": ", ".join(f"{name} {value:.1f}" for name, value in stds),
         "notes": "; ".join(poses.notes),
     }
 

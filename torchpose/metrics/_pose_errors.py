@@ -108,8 +108,9 @@ class ErrorSummary(NamedTuple):
 
     Attributes:
         mean: over all joints and frames pooled [].
-        per_joint: mean [J]; std: standard deviation [J]; median: [J].
-        counts: errors behind each of them [J]; what was missing is not among them.
+        per_joint: mean [J]; std: standard deviation [J].
+        median: [J], of an even number of errors the mean of both in the middle.
+        counts: errors behind each of them [J], infinite ones too; what was missing is not among them.
     """
 
     mean: Tensor
@@ -207,10 +208,17 @@ def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
     errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])
     flat = flat if len(flat) else flat.new_full((1, errors.shape[-1]), math.nan)
-    count = torch.isfinite(flat).sum(0)
+    count = (~flat.isnan()).sum(0)
     mean = flat.nanmean(0)
     std = (flat - mean).square().nanmean(0).sqrt()
-    return ErrorSummary(flat.nanmean(), mean, std, flat.nanmedian(0).values, count)
+    return ErrorSummary(flat.nanmean(), mean, std, _median(flat, count), count)
+
+
+def _median(flat: Float[Tensor, "T J"], count: Int[Tensor, " J"]) -> Float[Tensor, " J"]:
+    """Return the median of every column; of an even count the mean of both in the middle."""
+    ordered = flat.sort(0).values  # NaN come last
+    middle = torch.stack([(count - 1).clamp_min(0) // 2, count // 2])
+    return ordered.gather(0, middle).mean(0)
 
 
 def share_below(

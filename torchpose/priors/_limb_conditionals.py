@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_finite, check_rate, check_shape
+from torchpose._core.checks import check_choice, check_finite, check_rate, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.body._kinematics import Body, centres_of
-from torchpose.errors import InputError, PriorError
+from torchpose.errors import FileFormatError, InputError, PriorError
 from torchpose.math._rotation_gaussians import (
     left_matrix,
     quaternion_moments,
@@ -30,7 +30,7 @@ from torchpose.math._rotation_gaussians import (
 )
 from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._tree_messages import message_tree
-from torchpose.math._unscented import Directions
+from torchpose.math._unscented import DIRECTIONS, Directions
 from torchpose.priors._facts import FitFacts
 
 __all__ = [
@@ -52,6 +52,7 @@ PART_TREE: tuple[tuple[str, str], ...] = (
 )
 """Parts above and below of every edge (DX, Figure 2); the root sends no messages, it conditions all."""
 
+_DIRECTIONS = "sigma_point_directions"  # in `LimbInfo.extra` of a file, where they are not "eigen"
 _SAME_CENTRE = 1e-6  # of a quaternion vector
 
 
@@ -126,7 +127,7 @@ class LimbConditionals(nn.Module):
         diffusion: Sigma'_j per frame, [P, 3, 3], the root part's orientation in the world first.
         growth: g_j [P], by which it grows with the time t between frames as t^g: 1 for a random walk,
             as by default, 2 for limbs that swing on.
-        directions: the directions of sigma points.
+        directions: the directions of sigma points, see `sigma_points`.
 
     Attributes:
         info: as given. tree: a `MessageTree` over the P - 1 parts that are not the root.
@@ -135,7 +136,7 @@ class LimbConditionals(nn.Module):
 
     Raises:
         SkeletonError: edges with a cycle, an unknown part or a part with two above it. PriorError: an
-            edge of the root. ShapeError: sizes that do not go together.
+            edge of the root. ShapeError: sizes that do not go together. InputError: unknown directions.
 
     Reference: Daubney & Xie, sections 4 and 7.
     """
@@ -162,6 +163,7 @@ class LimbConditionals(nn.Module):
     ) -> None:
         super().__init__()
         n_parts, n_edges = len(info.parts), edges.shape[0]
+        check_choice("directions", directions, DIRECTIONS)
         check_shape("edges", edges, [None, 2])
         if bool(((edges < 0) | (edges >= n_parts)).any()):
             raise PriorError(
@@ -296,7 +298,10 @@ class LimbConditionals(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write them as safetensors; the file appears whole or not at all."""
-        write_tensors(path, _KIND, self.info, self._tensors())
+        info = self.info
+        if self.directions != "eigen":
+            info = replace(info, extra=info.extra | {_DIRECTIONS: self.directions})
+        write_tensors(path, _KIND, info, self._tensors())
 
     @classmethod
     def load(cls, path: str | Path) -> "LimbConditionals":
@@ -308,8 +313,14 @@ class LimbConditionals(nn.Module):
         info, tensors = read_tensors(path, _KIND)
         edges = tensors.pop("edges")
         plain = {name: value.double() for name, value in tensors.items()}
+        extra = dict(info.extra)
+        directions = extra.pop(_DIRECTIONS, "eigen")
+        if directions not in DIRECTIONS:
+            raise FileFormatError(
+                f"{path}: {_DIRECTIONS} must be one of {', '.join(DIRECTIONS)}, got {directions!r:.60}"
+            )
         with reading(path, "limb conditionals"):
-            return cls(info, edges, **plain, directions="eigen")
+            return cls(replace(info, extra=extra), edges, **plain, directions=directions)
 
     def extra_repr(self) -> str:
         rescaled = self.info.fps != self.info.fitted_fps

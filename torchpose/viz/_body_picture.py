@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.body._skeleton import BODY_15, BodySkeleton
-from torchpose.viz._skeletons import _limits, _set_view, draw_skeleton
+from torchpose.viz._skeletons import _choose_frames, _limits, _set_view, draw_skeleton
 from torchpose.viz._style import (
     INK,
     LEFT,
@@ -51,11 +51,11 @@ def plot_body_strip(
         first_frame: number of the first frame.
 
     Raises:
-        ShapeError: joints of another shape. MissingDependencyError: matplotlib is missing.
+        ShapeError: joints of another shape. InputError: no frame.
+            MissingDependencyError: matplotlib is missing.
     """
     check_shape("joints", joints, [None, len(skeleton.names), 3])
-    n_frames = min(n_frames, len(joints))
-    frames = torch.linspace(0, len(joints) - 1, n_frames).round().long().tolist()
+    frames = _choose_frames(None, n_frames, len(joints))
     centred = joints - joints[:, :1]
     low, high = _limits(centred[frames], margin=0.06)
     limbs = [(parent, joint) for joint, parent in enumerate(skeleton.parents) if parent >= 0]

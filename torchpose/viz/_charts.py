@@ -15,6 +15,7 @@ from torchpose.errors import InputError
 from torchpose.metrics._calibration import Coverage, chi2_quantile
 from torchpose.metrics._pose_errors import PCP
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.viz._skeletons import _check_poses
 from torchpose.viz._style import (
     INK,
     MUTED,
@@ -80,7 +81,7 @@ def plot_joint_curves(
         ShapeError: other sizes. InputError: an unknown joint.
             MissingDependencyError: matplotlib is missing.
     """
-    check_shape("joints", joints, [None, 8, None])
+    _check_poses(joints)
     require_matplotlib()
     from matplotlib.patches import Patch
 
@@ -226,7 +227,8 @@ def plot_error_bars(
         matplotlib `Figure`.
 
     Raises:
-        ShapeError: errors of another number of joints. MissingDependencyError: matplotlib is missing.
+        ShapeError: errors of another number of joints. InputError: no frame, or no method.
+            MissingDependencyError: matplotlib is missing.
     """
     require_matplotlib()
     from matplotlib.patches import Patch
@@ -239,6 +241,8 @@ def plot_error_bars(
     entries: list[Any] = []
     for i, (name, values) in enumerate(errors.items()):
         check_shape(f"errors[{name!r}]", values, ["...", 8])
+        if values.numel() == 0:
+            raise InputError(f"errors[{name!r}] must hold at least one frame, got none")
         flat = scale * values.detach().cpu().double().reshape(-1, 8)
         mean = to_numpy(flat.nanmean(0))
         levels = torch.tensor([0.25, 0.75], dtype=torch.float64)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError, ShapeError
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -282,10 +282,10 @@ def plot_pose_strip(
         matplotlib `Figure`.
 
     Raises:
-        ShapeError: joints of another shape. MissingDependencyError: matplotlib is missing.
+        ShapeError: joints of another shape. InputError: no frame, or one that there is not.
+            MissingDependencyError: matplotlib is missing.
     """
-    if joints.ndim != 3 or joints.shape[1] != 8 or joints.shape[2] not in (2, 3):
-        raise ShapeError(f"joints must be [T, 8, 2] or [T, 8, 3], got {list(joints.shape)}")
+    _check_poses(joints)
     frames = _choose_frames(frames, n_frames, joints.shape[0])
     columns = min(len(frames), 10)
     lines = math.ceil(len(frames) / columns)
@@ -316,8 +316,16 @@ def plot_pose_strip(
     return figure
 
 
+def _check_poses(joints: Tensor) -> None:
+    if joints.ndim != 3 or joints.shape[1] != 8 or joints.shape[2] not in (2, 3):
+        raise ShapeError(f"joints must be [T, 8, 2] or [T, 8, 3], got {list(joints.shape)}")
+
+
 def _choose_frames(frames: Sequence[int] | None, n_frames: int, total: int) -> list[int]:
+    if total == 0:
+        raise InputError("joints must hold at least one frame, got none")
     if frames is None:
+        check_count("n_frames", n_frames)
         return torch.linspace(0, total - 1, min(n_frames, total)).round().long().tolist()
     if not frames or not all(0 <= i < total for i in frames):
         raise InputError(f"frames must be indices below {total}, got {list(frames)}")

@@ -51,6 +51,7 @@ _METHODS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)),
                             (0, (3, 1, 1, 1, 1, 1)), "-")  # fmt: skip
 SMALL, NORMAL, LARGE = 9.0, 10.0, 11.5
+_EDGE = 0.1  # inches to either side of a title
 
 
 def require_matplotlib() -> None:
@@ -65,15 +66,20 @@ def require_matplotlib() -> None:
 
 
 def new_figure(width: float, height: float, title: str | None = None) -> Figure:
-    """Return an empty white figure of the given size in inches, laid out so that nothing overlaps."""
+    """Return an empty white figure of the given size in inches, laid out so that nothing overlaps.
+
+    It is wider where its title needs that.
+    """
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MatplotlibFigure
 
     figure = MatplotlibFigure(figsize=(width, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(figure)
     if title:
-        figure.suptitle(title, fontsize=LARGE, color=INK, fontweight="bold")
+        text = figure.suptitle(title, fontsize=LARGE, color=INK, fontweight="bold")
+        needed = text.get_window_extent(canvas.get_renderer()).width / figure.dpi + 2 * _EDGE
+        figure.set_figwidth(max(width, needed))
     return figure
 
 
@@ -100,12 +106,13 @@ def style_axes(ax: Axes, x: str = "", y: str = "", title: str = "", grid: bool =
 
 
 def add_legend(figure: Figure, handles: Iterable[Any]) -> None:
-    """Add a legend below the panels, in as many columns as fit the width."""
+    """Add a legend below the panels, in as many columns as fit the width, which becomes that of one."""
     entries = list(handles)
     if not entries:
         return
     widest = max(0.075 * len(entry.get_label()) + 0.7 for entry in entries)  # inches
-    fitting = max(1, min(len(entries), int(figure.get_figwidth() / widest)))
+    figure.set_figwidth(max(figure.get_figwidth(), widest))
+    fitting = min(len(entries), int(figure.get_figwidth() / widest))
     columns = math.ceil(len(entries) / math.ceil(len(entries) / fitting))
     figure.legend(
         handles=entries,
@@ -165,13 +172,13 @@ def side_of(name: str) -> str:
 
 
 def readable(name: str) -> str:
-    """Return a joint's name in words, ``hand_left`` as ``left hand``.
+    """Return a joint's name in words, its side first: ``hand_left`` as ``left hand``.
 
-    >>> readable("hand_left")
-    'left hand'
+    >>> readable("hand_left"), readable("left_wrist"), readable("right_upper_arm")
+    ('left hand', 'left wrist', 'right upper arm')
     """
-    stem, _, side = name.rpartition("_")
-    return f"{side} {stem}" if stem else name
+    side = side_of(name)
+    return " ".join(sorted(name.split("_"), key=lambda word: word != side))
 
 
 def join_unit(label: str, unit: str) -> str:

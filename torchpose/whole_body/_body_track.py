@@ -209,9 +209,15 @@ class BodyTrack:
                 f"{path}: expected {_DETAIL}actions of {len(self.action_names)} actions, got the sizes "
                 f"{list(actions.shape)}"
             )
+        inlier = self.details.get("inlier")
+        if inlier is not None and (inlier.ndim != 3 or inlier.shape[2] != len(self.names)):
+            raise FileFormatError(
+                f"{path}: expected {_DETAIL}inlier of cameras and {len(self.names)} joints, got the sizes "
+                f"{list(inlier.shape)!s:.60}"
+            )
 
     def joints_std(self) -> Tensor:
-        """Return the standard deviation of every joint [T, J], metres, the mean of the three axes."""
+        """Return the standard deviation of every joint [T, J], metres: of an axis, by the mean variance."""
         variance = self.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1)
         return variance.clamp_min(0).sqrt()
 
@@ -243,17 +249,25 @@ class BodyTrack:
             camera: with a pose in the room.
 
         Returns:
-            `CameraPoses`: joints [1, T, J, 3], metres, and their covariances [1, T, J, 3, 3], square metres.
+            `CameraPoses`: joints [1, T, J, 3], metres, their covariances [1, T, J, 3, 3], square metres, and
+            which of them were observed [1, T, J]: all where a camera saw the person; of keypoints
+            (``details["inlier"]``) those of which a camera's was the joint's with more than 1/2.
         """
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
         return CameraPoses(
             joints3d=(self.joints3d @ R.mT + t)[None],
             covariance3d=(R @ self.covariance3d @ R.mT)[None],
-            observed=~self.coasting[None, :, None].expand(1, -1, len(self.names)),
+            observed=self._observed()[None],
             failed_at=torch.full((1,), -1),
             names=self.names,
             fps=self.fps,
         )
+
+    def _observed(self) -> Bool[Tensor, "T J"]:
+        """Return which joints a camera measured: all of a silhouette, of keypoints those that are inliers."""
+        seen = ~self.coasting[:, None].expand(-1, len(self.names))
+        inlier = self.details.get("inlier")
+        return seen if inlier is None else seen & (inlier > 0.5).any(1)
 
 
 def repeat_last(track: BodyTrack, count: int) -> BodyTrack:

@@ -91,7 +91,7 @@ def follow(
     for silhouettes, keypoints in frames:
         outlined = None if silhouettes is None else silhouettes[None]
         if outlined is not None:
-            check_observation(outlined, 1, plain=not callable(model.likelihood))
+            check_observation(outlined, 1, generator, plain=not callable(model.likelihood))
         more = () if keypoints is None else (keypoints,)
         state, out = model.filter_frame(state, outlined, cameras, generator, *more)
         steps.append(out)

@@ -11,7 +11,12 @@ from torch import Tensor
 from torchpose._core.checks import check_choice, check_finite, check_shape
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
-from torchpose.filters._recursive_filter import Generators, standard_normal, uniform
+from torchpose.filters._recursive_filter import (
+    Generators,
+    check_generators,
+    standard_normal,
+    uniform,
+)
 from torchpose.math._rotations import (
     compose,
     minimal_rotation,
@@ -228,7 +233,7 @@ def find_candidates(
         facing: [3], the world direction that the person faces to within 60 degrees, if it is known.
 
     Raises:
-        InputError: no camera sees the person, or a bad setting. ShapeError, CameraError: silhouettes,
+        InputError: no camera sees the person, or a bad setting or list. ShapeError, CameraError: silhouettes,
         cameras or prior of other sizes. PriorError: a manifold of another skeleton.
     """
     check_choice("likelihood", likelihood, LIKELIHOODS)
@@ -240,6 +245,7 @@ def find_candidates(
     check_shape("silhouettes", silhouettes, ["B", "C", "H", "W"])
     if silhouettes.dtype != torch.bool:
         raise InputError(f"silhouettes must be bool (True = person), got {silhouettes.dtype}")
+    check_generators(generator, len(silhouettes))
     rig = as_rig(cameras)
     rig.check_images("silhouettes", silhouettes.shape[1:])
     up = world_up(rig, up).to(body.offsets)

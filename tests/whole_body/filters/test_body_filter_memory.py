@@ -88,6 +88,18 @@ def test_a_trend_holds_what_was_before_and_details_are_reported_for_every_frame(
     torch.testing.assert_close(alone.details["age"], out.details["age"][1])
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_list_of_generators_holds_one_for_each_element_online_too(count):
+    model, start = tracker(), torch.zeros(2, 2, dtype=WIDE)
+    with pytest.raises(InputError, match=f"each of the 2 sequences, got {count}"):
+        model.init(start, generator=generators(count), initial_cov=1.0)
+    state = model.init(start, generator=generators(2), initial_cov=1.0)
+    with pytest.raises(InputError, match=f"each of the 2 sequences, got {count}"):
+        model.step(state, start, None, generator=generators(count))
+    with pytest.raises(InputError, match=f"each of the 2 sequences, got {count}"):
+        model.advance(state, start[:, None], None, generator=generators(count))
+
+
 def test_particles_that_died_start_with_a_memory_of_their_own():
     def deadly(states, frame):
         return near(states, frame).masked_fill(frame[:, :1] > 5, -math.inf)

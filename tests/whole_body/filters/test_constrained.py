@@ -340,6 +340,11 @@ def test_a_gate_that_rejects_everything_is_reported():
         state, out = tracker.step(tracker.init(start), FRAME, None, generator=generator())
     assert out.details["clamped"] == 1 and out.details["acceptance"] == 0
     assert out.details["redraws"] == 3
+    # past the length of a sequence what is reported repeats, and is not warned of again
+    frames, lengths = FRAME.expand(2, 3, 1), torch.tensor([1, 2])
+    with pytest.warns(DegenerateFilterWarning, match="particles 3 times .*element 1 at frame 1.,"):
+        out = tracker(frames, None, start.expand(2, -1), generator=generator(), lengths=lengths)
+    assert out.details["clamped"].tolist() == [[1, 1, 1]] * 2
     z = BEND.project(state_postures(BODY, state.particles[0]))
     off = ((z[:, None] - BEND.performance).abs() - 2 * BEND.std).amax(-1).amin(-1)
     assert off.max() < 12  # degrees: shoulders are fixed in the torso, so not quite at the border

@@ -98,8 +98,25 @@ def test_an_element_that_nobody_sees_coasts_beside_one_that_is_seen():
     after, out = filter_.step(state, frame, rig(), generator=seeded(0, 1))
     assert out.coasting.tolist() == [False, True]
     assert torch.equal(after.particles[1, :, 6:], state.particles[1, :, 6:])
-    torch.testing.assert_close(after.log_weights[1], state.log_weights[1])
+    assert torch.equal(after.log_weights[1], state.log_weights[1])
     assert not torch.equal(after.particles[0, :, 6:], state.particles[0, :, 6:])
+
+
+def test_limits_hold_for_an_element_that_coasts_whoever_its_neighbours_are():
+    _, _, truth, silhouettes = scene()
+    ends = 0.05 + truth[0, 6:].abs()
+    filter_ = tracker(10, limits=JointLimits(-ends, ends, torch.full((30,), 0.01).double()))
+    starts = truth[:2].clone()
+    starts[1, 8] = ends[2] + 0.2  # outside
+    frame = silhouettes[:2].clone()
+    frame[1] = False
+    with pytest.warns(DegenerateFilterWarning, match="element 1"):
+        after, out = filter_.step(filter_.init(starts), frame, rig(), generator=seeded(0, 1))
+    with pytest.warns(DegenerateFilterWarning, match="element 0"):
+        alone, _ = filter_.step(filter_.init(starts[1:]), frame[1:], rig(), generator=seeded(1))
+    assert out.respread.tolist() == [False, True]
+    assert torch.equal(after.particles[1], alone.particles[0])
+    assert torch.equal(after.memory[1], alone.memory[0])
 
 
 def test_hypotheses_weigh_as_the_product_over_parts_of_sums_over_places():

@@ -24,7 +24,8 @@ function writeValues() {
     return;
   }
   const numbers = ["x", "y", "z"].map((axis, i) => {
-    const half = 100 * RADIUS_2D * Math.sqrt(Math.max(0, covariance[6 * joint + [0, 3, 5][i]]));
+    const variance = covariance ? covariance[6 * joint + [0, 3, 5][i]] : NaN; // null: none is finite
+    const half = 100 * RADIUS_2D * Math.sqrt(Math.max(0, variance));
     return `${axis} ${decimals(100 * joints[3 * joint + i], 1)} ± ${decimals(half, 1)}`;
   });
   const measured = isMeasured(p, state.frame - p.first, joint);

@@ -215,8 +215,9 @@ function buildStrips() {
   });
 }
 
-/** With a proper minus sign. */
-const decimals = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
+/** With a proper minus sign; a question mark for what is not finite. */
+const decimals = (value, digits) =>
+  Number.isFinite(value) ? value.toFixed(digits).replace("-", "\u2212") : "?";
 
 /** 100 % only for all frames, 0 % only for none. */
 function percent(share) {

@@ -195,8 +195,8 @@ def check_sequences(
     return frames, start, batched or several
 
 
-def check_observation(observed: Tensor, batch: int, *, plain: bool) -> None:
-    """Raise unless this is one frame [B, ...] of B sequences.
+def check_observation(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:
+    """Raise unless this is one frame [B, ...] of B sequences, and generators suit.
 
     Raises:
         ShapeError, InputError: as `SilhouetteParticleFilter.step`.
@@ -209,6 +209,7 @@ def check_observation(observed: Tensor, batch: int, *, plain: bool) -> None:
     if plain:
         check_shape("silhouettes", observed, ["B", "C", "H", "W"])
         _check_silhouettes(observed)
+    check_generators(generator, batch)
 
 
 def check_observations(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:

@@ -33,6 +33,7 @@ __all__ = [
     "stack_outputs",
     "take_particles",
     "warn_of_frames",
+    "without_repeats",
 ]
 
 _LISTED = 8  # frames that a warning names
@@ -197,6 +198,18 @@ def stack_outputs(
     return BodyFilterOutput(
         **parts, details={name: value[rows, held] for name, value in details.items()}
     )
+
+
+def without_repeats(track: BodyFilterOutput, lengths: Int[Tensor, " B"] | None) -> BodyFilterOutput:
+    """Return a track [B, T, ...] whose details are zero past the lengths, where they repeat the last ones."""
+    if lengths is None:
+        return track
+    past = torch.arange(track.mean.shape[1], device=lengths.device) >= lengths[:, None]
+    details = {
+        name: value.masked_fill(past.view(*past.shape, *[1] * (value.ndim - 2)), 0)
+        for name, value in track.details.items()
+    }
+    return track._replace(details=details)
 
 
 def reweight(

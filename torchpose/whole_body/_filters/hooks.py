@@ -127,7 +127,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """Warn of the frames of a track in which the filter degenerated.
 
         Args:
-            track: the track of a batch, [B, T, ...].
+            track: the track of a batch, [B, T, ...]; past the length of a sequence its details are zero.
         """
         warn_of_frames(track.respread, _DIED)
 

@@ -222,20 +222,20 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         roots = self._diffuse_roots(state.particles, generator)
         mean = roots[..., _ROOT:].unflatten(-1, (-1, 3))
         covariance = self.conditionals.diffuse(mean, self._memory(state))[1]
-        nothing = torch.zeros_like(state.log_weights[:, 0])
-        coasting = WeightedParticles(roots, state.log_weights, nothing, covariance)
-        if not bool(frame.seen.any()):
-            return coasting
-        seen = self._update(roots, mean, covariance, frame)
-        particles = torch.where(frame.seen[:, None, None], seen[0], roots)
-        covariance = torch.where(frame.seen[:, None, None, None, None], seen[1], covariance)
+        particles, value = roots, torch.zeros_like(state.log_weights)
+        if bool(frame.seen.any()):
+            seen = self._update(roots, mean, covariance, frame)
+            particles = torch.where(frame.seen[:, None, None], seen[0], roots)
+            covariance = torch.where(frame.seen[:, None, None, None, None], seen[1], covariance)
+            value = torch.where(frame.seen[:, None], seen[2], 0.0)
         log_limits = self.log_limits(particles)
-        value = torch.where(frame.seen[:, None], seen[2], 0.0)
         exponent = survival_exponent(value + log_limits, self.survival_rate)[:, None]
         moved = reweight(particles, state.log_weights + log_limits, exponent * value)
+        coasting = ~frame.seen & (log_limits == 0).all(-1)  # exactly: without rounding
         return moved._replace(
-            memory=covariance, log_evidence=torch.full_like(moved.log_evidence, torch.nan)
-        )
+            log_weights=torch.where(coasting[:, None], state.log_weights, moved.log_weights),
+            memory=covariance, log_evidence=torch.full_like(moved.log_evidence, torch.nan),
+        )  # fmt: skip
 
     def swap_memory(
         self, memory: Float[Tensor, "B N V 3 3"], swapped: Bool[Tensor, "B N"]

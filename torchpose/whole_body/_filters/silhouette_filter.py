@@ -25,7 +25,7 @@ from torchpose._core.moved import warn_of_former
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
 from torchpose.filters._outputs import effective_sample_size
-from torchpose.filters._recursive_filter import Generators, standard_normal
+from torchpose.filters._recursive_filter import Generators, check_generators, standard_normal
 from torchpose.filters._resampling import RESAMPLING
 from torchpose.whole_body._filters.body_frames import (
     Frame,
@@ -45,6 +45,7 @@ from torchpose.whole_body._filters.body_particles import (
     best_particle,
     resample_state,
     stack_outputs,
+    without_repeats,
 )
 from torchpose.whole_body._filters.hooks import BodyFilterHooks
 from torchpose.whole_body._filters.legs import check_leg_swap, extra_copies, swap_legs
@@ -202,11 +203,12 @@ class SilhouetteParticleFilter(BodyFilterHooks):
             `BodyFilterState` with particles [B, N, D].
 
         Raises:
-            ShapeError: other sizes. InputError: NaN or infinite numbers.
+            ShapeError: other sizes. InputError: NaN or infinite numbers, a list of another length.
         """
         start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
         check_finite("initial_state", start)
+        check_generators(generator, len(start))
         particles = start[:, None].expand(-1, self.n_particles, -1).contiguous()
         if initial_cov is not None:
             spread = std_of_covariance("initial_cov", initial_cov, self.body.dim)
@@ -239,7 +241,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
-        check_observation(silhouettes, len(state.mean), plain=self._plain)
+        check_observation(silhouettes, len(state.mean), generator, plain=self._plain)
         state, out = self.filter_frame(state, silhouettes, cameras, generator)
         self.warn(stack_outputs([out]))
         return state, out
@@ -268,6 +270,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         """
         if self._plain and silhouettes.ndim == 4:
             warn_of_former("advance is of several frames now, filter_frame of one; one frame goes")
+            check_observation(silhouettes, len(state.mean), generator, plain=True)
             return self.filter_frame(state, silhouettes, cameras, generator)
         check_observations(silhouettes, len(state.mean), generator, plain=self._plain)
         return self._run(state, silhouettes, cameras, generator)
@@ -288,7 +291,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
             state, out = self.filter_frame(state, shown, cameras, generator)
             steps.append(out)
         track = stack_outputs(steps, lengths)
-        self.warn(track)
+        self.warn(without_repeats(track, lengths))
         return state, track
 
     def filter_frame(
