@@ -188,6 +188,8 @@ def test_bad_input_is_named(scene) -> None:
             viz.plot_pose_strip(joints, n_frames=n_frames)
         with pytest.raises(InputError, match="at least"):
             plot_body_strip(joints.repeat(1, 2, 1)[:, :15], n_frames=n_frames)
+    with pytest.raises(InputError, match="a word for each of 120 frames, got 2"):
+        viz.plot_pose_strip(scene.joints, labels=["a", "b"])
     with pytest.raises(InputError, match="at least one frame"):
         viz.plot_error_bars({"a": torch.zeros(0, 8)})
     with pytest.raises(ShapeError, match=r"joints must be \[T, 8, 2\]"):

@@ -377,6 +377,9 @@ def test_a_known_height_scales_the_body_and_its_distance():
     for height in (17.0, 0.0, float("nan"), "1.7"):
         with pytest.raises(InputError, match="height must lie between"):
             tracker(height=height)
+    for metres in ((0.3, 0.01), "long", 30.0):
+        with pytest.raises(InputError, match="bone_lengths must lie between"):
+            tracker(bone_lengths={"upper_arm": metres})
 
 
 def test_smoothing_sums_over_all_later_paths():

@@ -58,6 +58,13 @@ def two_persons(pair):
     return rendered(*pair)
 
 
+@pytest.mark.parametrize("wrong", [{"max_persons": 1.5}, {"seed": "a"}, {"seed": 1.5}])
+def test_what_is_no_whole_number_is_refused(wrong):
+    shipped = load_prior("kinect-upper-body-small")
+    with pytest.raises(InputError, match="must be a whole number"):
+        VideoTracker(shipped, demo_camera(), **wrong)
+
+
 def test_bones_alone_track_unless_the_prior_knows_others():
     shipped = load_prior("kinect-upper-body-small")
     assert VideoTracker(shipped, demo_camera()).tracker.method == "articulated"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -166,12 +167,12 @@ class BodyLengths:
             raise InputError("bone_lengths must hold at least one length, got none; leave it out")
         for name, metres in given.items():
             check_choice("bone_lengths", name, BODY_LENGTHS)
-            if not _SHORTEST <= metres <= _LONGEST:
+            if not _SHORTEST <= _number(metres) <= _LONGEST:
                 raise InputError(
                     f"bone_lengths must lie between {_SHORTEST} and {_LONGEST} m, got {name} = {metres!r}"
                 )
         rows = [BODY_LENGTHS.index(name) for name in given]
-        values = self.usual.new_tensor(list(given.values()))
+        values = self.usual.new_tensor([_number(metres) for metres in given.values()])
         lengths = values + self.lower[rows]
         self._expect(rows, lengths, _GIVEN * (values / lengths))
 
@@ -288,3 +289,11 @@ class BodyLengths:
             slope = both * expected * (seen - expected) / variance
             found.append((slope, both * expected.square() / variance))
         return found[0], found[1]
+
+
+def _number(value: Any) -> float:
+    """Return a value as a number, NaN if it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan

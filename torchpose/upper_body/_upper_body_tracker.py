@@ -254,8 +254,8 @@ class UpperBodyTracker(WideModule):
 
         Args:
             keypoints: [B, T, J, 2], pixels of the camera; NaN where one is missing.
-            confidence: [B, T, J], 0 to 1, by which the measurement covariance is divided; 0 or NaN
-                where a keypoint is missing.
+            confidence: [B, T, J], 0 to 1, by which the measurement covariance is divided, and by which a
+                keypoint may be an outlier (docs/mathematics.md, "Outliers"); 0 or NaN where it is missing.
             names: the names of the J joints, in any order and spelling that `torchpose.skeleton` knows;
                 may be left out if J = 8 and they are in the order of `UPPER_BODY`. Nose, eyes and ears
                 tell "articulated" where the body faces.

@@ -170,6 +170,9 @@ class VideoTracker(nn.Module):
         **options: Unpack[TrackerOptions],
     ) -> None:
         super().__init__()
+        for name, value in (("max_persons", max_persons), ("seed", seed)):
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
+                raise InputError(f"{name} must be a whole number, got {value!r}")
         if max_gap is not None and not max_gap > 0:
             raise InputError(f"max_gap must be positive, got {max_gap}")
         if candidates and hands == "mean-shift":

@@ -282,10 +282,14 @@ def plot_pose_strip(
         matplotlib `Figure`.
 
     Raises:
-        ShapeError: joints of another shape. InputError: no frame, or one that there is not.
-            MissingDependencyError: matplotlib is missing.
+        ShapeError: joints of another shape. InputError: no frame, one that there is not, labels of
+            another number. MissingDependencyError: matplotlib is missing.
     """
     _check_poses(joints)
+    if labels is not None and len(labels) != len(joints):
+        raise InputError(
+            f"labels must be a word for each of {len(joints)} frames, got {len(labels)}"
+        )
     frames = _choose_frames(frames, n_frames, joints.shape[0])
     columns = min(len(frames), 10)
     lines = math.ceil(len(frames) / columns)
