@@ -16,6 +16,7 @@ from torchpose.errors import (
 )
 
 __all__ = [
+    "MOST_CONFIDENCE",
     "check_choice",
     "check_count",
     "check_covariance",
@@ -29,10 +30,13 @@ __all__ = [
     "check_rgb",
     "check_shape",
     "check_weights",
+    "number_of",
     "refuse_export",
     "refuse_unused",
 ]
 
+MOST_CONFIDENCE = 2.0
+"""Of a keypoint: peaks of heat maps may exceed 1, and count as 1; more is a score in percent."""
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second
 
@@ -153,12 +157,17 @@ def check_positive(name: str, value: float) -> float:
     return value
 
 
+def number_of(value: Any) -> float:
+    """Return a value as a number, NaN if it is none; text and truth values are none."""
+    try:
+        return math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
 def check_height(height: float, name: str = "height") -> float:
     """Return the height of a person, or raise `InputError` unless it can be one in metres."""
-    try:
-        metres = math.nan if isinstance(height, bool | str) else float(height)
-    except (TypeError, ValueError):
-        metres = math.nan
+    metres = number_of(height)
     if not _SMALLEST <= metres <= _TALLEST:
         raise InputError(
             f"{name} must lie between {_SMALLEST} and {_TALLEST} m, got {height!r}; it is in metres"

@@ -163,13 +163,11 @@ def _crowd_notes(
     parts: Sequence[CameraKeypoints], cameras: "Sequence[PinholeCamera]"
 ) -> Iterator[str]:
     """Say in which cameras several people stand, of whom one is followed."""
+    from torchpose.io._keypoints import said_of_crowd
+
     for part, camera in zip(parts, cameras, strict=True):
-        several = torch.zeros(0) if part.n_people is None else (part.n_people > 1).nonzero()
-        if part.n_people is not None and len(several):
-            yield (
-                f"camera {camera.name}: several people, up to {int(part.n_people.max())}, from frame "
-                f"{int(several[0])} on; one of them is tracked, and --persons all tracks everybody"
-            )
+        if crowd := said_of_crowd(part.n_people):
+            yield f"camera {camera.name}: {crowd}, and --persons all tracks everybody"
 
 
 def common_rate(rates: Sequence[float], given: float | None) -> tuple[float, tuple[str, ...]]:

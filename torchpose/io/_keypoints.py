@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import check_rate
+from torchpose._core.checks import MOST_CONFIDENCE, check_rate
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose.camera._projection import check_intrinsics
@@ -29,13 +29,12 @@ from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 from torchpose.skeleton._upper_body import NECK_KINDS
 
-__all__ = ["Keypoints", "read_keypoints", "write_keypoints"]
+__all__ = ["Keypoints", "read_keypoints", "said_of_crowd", "write_keypoints"]
 
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
 _NORMALISED = 2.0  # no more are shares of the image, in which joints may lie outside
 _SEVERAL = 6  # keypoints
-_MOST_CONFIDENCE = 2.0  # peaks of heat maps may exceed 1, and count as 1
 
 
 @dataclass
@@ -75,6 +74,21 @@ class Keypoints:
     def measured(self) -> Tensor:
         """Return [T, J] bool, True where there is a measurement."""
         return torch.isfinite(self.keypoints).all(-1)
+
+
+def said_of_crowd(n_people: Tensor | None) -> str:
+    """Return a phrase about several people in the frames, of whom one is followed; empty without.
+
+    Args:
+        n_people: how many are in each frame [T], None if one is.
+    """
+    several = torch.zeros(0) if n_people is None else (n_people > 1).nonzero()
+    if n_people is None or not len(several):
+        return ""
+    return (
+        f"several people, up to {int(n_people.max())}, from frame {int(several[0])} on; one of them is "
+        "tracked"
+    )
 
 
 def read_keypoints(path: str | Path) -> Keypoints:
@@ -269,7 +283,7 @@ def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]
     if (confidence < 0).any() or np.isinf(confidence).any():
         bad = confidence[(confidence < 0) | np.isinf(confidence)][0]
         raise FileFormatError(f"{path}: confidences must be finite and at least 0, got {bad:g}")
-    if confidence.max(initial=0.0) > _MOST_CONFIDENCE:
+    if confidence.max(initial=0.0) > MOST_CONFIDENCE:
         raise FileFormatError(
             f"{path}: confidences must lie in [0, 1], got {confidence.max():g}; divide scores in percent "
             "by 100"

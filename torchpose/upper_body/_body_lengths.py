@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_height
+from torchpose._core.checks import check_choice, check_height, number_of
 from torchpose.errors import InputError
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.upper_body._estimator import Bones
@@ -167,12 +166,12 @@ class BodyLengths:
             raise InputError("bone_lengths must hold at least one length, got none; leave it out")
         for name, metres in given.items():
             check_choice("bone_lengths", name, BODY_LENGTHS)
-            if not _SHORTEST <= _number(metres) <= _LONGEST:
+            if not _SHORTEST <= number_of(metres) <= _LONGEST:
                 raise InputError(
                     f"bone_lengths must lie between {_SHORTEST} and {_LONGEST} m, got {name} = {metres!r}"
                 )
         rows = [BODY_LENGTHS.index(name) for name in given]
-        values = self.usual.new_tensor([_number(metres) for metres in given.values()])
+        values = self.usual.new_tensor([number_of(metres) for metres in given.values()])
         lengths = values + self.lower[rows]
         self._expect(rows, lengths, _GIVEN * (values / lengths))
 
@@ -289,11 +288,3 @@ class BodyLengths:
             slope = both * expected * (seen - expected) / variance
             found.append((slope, both * expected.square() / variance))
         return found[0], found[1]
-
-
-def _number(value: Any) -> float:
-    """Return a value as a number, NaN if it is none."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return math.nan

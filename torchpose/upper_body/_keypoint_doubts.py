@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import torch
 
 from torchpose.errors import CameraError
-from torchpose.io._keypoints import Keypoints
+from torchpose.io._keypoints import Keypoints, said_of_crowd
 from torchpose.skeleton._joint_sets import canonical_names
 
 __all__ = ["doubts_about", "refuse_another_size"]
@@ -42,12 +42,8 @@ def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> N
 
 def doubts_about(keypoints: Keypoints) -> Iterator[str]:
     """Yield a note on each doubt about the keypoints of a file."""
-    several = torch.zeros(0) if keypoints.n_people is None else keypoints.n_people > 1
-    if bool(several.any()) and keypoints.n_people is not None:
-        yield (
-            f"several people, up to {int(keypoints.n_people.max())}, from frame {int(several.nonzero()[0])} "
-            "on; one of them is tracked"
-        )
+    if crowd := said_of_crowd(keypoints.n_people):
+        yield crowd
     if keypoints.first_frame:
         yield f"frame 0 is number {keypoints.first_frame} of the file"
     if _upside_down(keypoints):

@@ -2,7 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from torchpose._core.checks import check_rate
@@ -16,6 +17,7 @@ _PATIENCE = 5  # reads without a frame, one after another, before a camera count
 _PAUSE = 0.02  # seconds between them
 _WRONG = 0.05  # share by which two rates may differ
 _PAUSES = 10.0  # times the usual time between frames, which is then a pause
+_REMEMBERED = 10_000  # frames, so that a camera may run for days
 _TELLING = 2.0  # seconds of frames that tell at what rate they are read
 
 
@@ -115,7 +117,8 @@ class CameraSource(VideoSource):
     def _read(self) -> Iterator[VideoFrame]:
         import cv2
 
-        times: list[float] = []
+        times: deque[float] = deque(maxlen=_REMEMBERED)
+        count = 0
         due = 0.0  # seconds
         try:
             for image, seconds in self._images():
@@ -124,11 +127,12 @@ class CameraSource(VideoSource):
                 # after a pause frames are due from then on, and none is made up for
                 due = max(due, seconds - 1 / self.fps) + 1 / self.fps
                 times.append(seconds)
-                yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, len(times) - 1)
+                count += 1
+                yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, count - 1)
         finally:  # also if it is closed
             self._note_rate(times)
         self.notes.append(
-            f"{self.name} gave no more frames after {len(times)}: unplugged, or taken by another program"
+            f"{self.name} gave no more frames after {count}: unplugged, or taken by another program"
         )
 
     def _images(self) -> Iterator[tuple[Any, float]]:
@@ -144,8 +148,8 @@ class CameraSource(VideoSource):
                 )
             yield image, now - start
 
-    def _note_rate(self, times: list[float]) -> None:
-        """Add a note if frames were read at another rate than was assumed, pauses apart."""
+    def _note_rate(self, times: Sequence[float]) -> None:
+        """Add a note if the last frames were read at another rate than was assumed, pauses apart."""
         if not times or times[-1] < _TELLING:
             return
         import numpy as np

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import (
+    MOST_CONFIDENCE,
     check_choice,
     check_height,
     check_positive,
@@ -54,9 +55,6 @@ INLIER = (0.05, 0.97)
 """Least and largest prior probability that a keypoint is its joint's."""
 PIXEL_STD = 1.0
 """Pixels, how far keypoints are from projected joints, beside what they are off in space."""
-_MOST_CONFIDENCE = (
-    2.0  # peaks of heat maps may exceed 1, which then counts; percentages are refused
-)
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
@@ -233,7 +231,7 @@ class KeypointBodyTracker(nn.Module):
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
         trust = trust.nan_to_num(0.0)
         known = torch.isfinite(points).all(-1)
-        outside = known & ((trust < 0) | (trust > _MOST_CONFIDENCE))
+        outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
         if bool(outside.any()):
             raise InputError(
                 f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "

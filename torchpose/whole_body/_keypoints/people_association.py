@@ -31,7 +31,14 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 
-__all__ = ["assign", "detection_gains", "group_detections", "left_over", "taken_detections"]
+__all__ = [
+    "assign",
+    "detection_gains",
+    "group_detections",
+    "left_over",
+    "owned_detections",
+    "taken_detections",
+]
 
 LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
 _BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
@@ -99,8 +106,7 @@ def left_over(gains: Float[Tensor, "P C D"], chosen: Int[Tensor, "P C"]) -> Int[
     Args:
         gains: by which they may get one. chosen: what they have already, -1 if none.
     """
-    places = torch.arange(gains.shape[-1], device=gains.device)
-    owned = (chosen[..., None] == places).any(0)
+    owned = owned_detections(chosen, gains.shape[-1])
     rest = gains.masked_fill(owned | (chosen >= 0)[..., None], -math.inf)
     return torch.where(chosen >= 0, chosen, assign(rest))
 
@@ -140,6 +146,11 @@ def _hungarian(values: np.ndarray) -> np.ndarray:
     real = (owner >= 0) & (np.arange(len(owner)) < n_columns)
     found[owner[real]] = np.nonzero(real)[0]
     return found
+
+
+def owned_detections(chosen: Int[Tensor, "P C"], count: int) -> Bool[Tensor, "C D"]:
+    """Return which of so many detections of each camera are somebody's."""
+    return (chosen[..., None] == torch.arange(count, device=chosen.device)).any(0)
 
 
 def taken_detections(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> KeypointFrame:

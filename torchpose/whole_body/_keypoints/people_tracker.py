@@ -20,6 +20,7 @@ from torchpose.whole_body._keypoints.people_association import (
     detection_gains,
     group_detections,
     left_over,
+    owned_detections,
     taken_detections,
 )
 
@@ -125,7 +126,7 @@ class PeopleTracker:
         found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
         weak = stream.missed > _ALONE_TIME * self.tracker.filter.fps
         explained = (gains > 0).masked_fill(weak[:, None, None], False).any(0)
-        owned = _owned(chosen[~weak], there)
+        owned = owned_detections(chosen[~weak], there.shape[1])
         return stream._replace(bodies=after), found, there & ~explained & ~owned, weak
 
     def _chosen(
@@ -275,12 +276,6 @@ def _needed(owner: Bool[Tensor, "P G"], found: PeopleFrame | None) -> Float[Tens
         return _LEAST_INLIERS
     followed = _AS_WELL * _explained(found.poses, found.keypoints)
     return (followed[:, None] * owner).sum(0).clamp_min(_LEAST_INLIERS)
-
-
-def _owned(chosen: Int[Tensor, "P C"], there: Bool[Tensor, "C D"]) -> Bool[Tensor, "C D"]:
-    """Return which detections are somebody's."""
-    places = torch.arange(there.shape[1], device=there.device)
-    return (chosen[..., None] == places).any(0)
 
 
 def _doubled(joints: Float[Tensor, "P J 3"]) -> Bool[Tensor, " P"]:
