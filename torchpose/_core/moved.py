@@ -462,11 +462,17 @@ def moved_from(package: str) -> list[tuple[str, str, str]]:
 
 
 def moved_function(old: str, new: str) -> Callable[..., Any]:
-    """Look up the function that replaced a method, and warn the method's caller."""
-    _warn(old, new)
+    """Return a method of before, which warns its caller and calls the function that replaced it.
+
+    That function is looked up at the call, since its room is above that of the method.
+    """
     home, _, name = new.rpartition(".")
-    function: Callable[..., Any] = getattr(import_module(home), name)
-    return function
+
+    def call(*args: Any, **options: Any) -> Any:
+        _warn(old, new)
+        return getattr(import_module(home), name)(*args, **options)
+
+    return call
 
 
 def install() -> None:

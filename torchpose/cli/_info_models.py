@@ -23,7 +23,7 @@ def describe_manifold(path: Path) -> Facts:
         "manifold": info.name or "without a name",
         "latent space": f"{manifold.latents.shape[-1]} dimensions",
         "poses": f"{n_frames} frames of {n_columns} columns, rotations against the {info.frame}",
-        "noise": "for the filter" if known else "not fitted yet: the filter needs fit_noise",
+        "noise": "for the filter" if known else "not fitted yet: the filter needs fit_gplvm_noise",
         "fps": _number(info.fps),
         "held-out error": _number(info.extra.get("held_out_error")),
         "actions": _listed(info.actions),

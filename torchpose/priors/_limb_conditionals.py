@@ -8,7 +8,7 @@ are what `torchpose.math._tree_messages` passes messages with.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -31,7 +31,6 @@ from torchpose.math._rotation_gaussians import (
 from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._tree_messages import message_tree
 from torchpose.math._unscented import DIRECTIONS, Directions
-from torchpose.priors._facts import FitFacts
 
 __all__ = [
     "LEAST_STD",
@@ -189,25 +188,9 @@ class LimbConditionals(nn.Module):
             check_finite(name, value)
             register_given(self, name, value)
 
-    @classmethod
-    def fit(
-        cls,
-        body: Body,
-        sequences: Tensor | Sequence[Tensor],
-        fps: float,
-        *,
-        edges: Sequence[tuple[str, str]] = PART_TREE,
-        least_std: float = LEAST_STD,
-        **facts: Unpack[FitFacts],
-    ) -> "LimbConditionals":
-        """Fit limbs. Deprecated: `torchpose.learning.fit_limb_conditionals`, with the same arguments."""
-        # learning is a layer above: until this goes, it is looked up by its name
-        name = "torchpose.learning.fit_limb_conditionals"
-        fit = moved_function("LimbConditionals.fit", name)
-        limbs: LimbConditionals = fit(
-            body, sequences, fps, edges=edges, least_std=least_std, **facts
-        )
-        return limbs
+    fit = staticmethod(
+        moved_function("LimbConditionals.fit", "torchpose.learning.fit_limb_conditionals")
+    )
 
     # --- messages -----------------------------------------------------------------------------
 

@@ -470,7 +470,7 @@ def test_what_the_manifold_filter_refuses():
         ManifoldParticleFilter(body, six_root_manifold(), weights="exact")
     with pytest.raises(InputError, match="proposal must be one of"):
         ManifoldParticleFilter(body, six_root_manifold(), proposal="exact")
-    with pytest.raises(PriorError, match="fit_noise"):
+    with pytest.raises(PriorError, match="fit_gplvm_noise"):
         ManifoldParticleFilter(body, six_root_manifold(std_pose=tensor([math.nan] * 3)))
     with pytest.raises(ShapeError, match="std_pose"):
         ManifoldParticleFilter(body, six_root_manifold(std_pose=tensor([0.1])))

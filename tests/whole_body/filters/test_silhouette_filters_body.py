@@ -133,7 +133,7 @@ def test_a_manifold_of_another_body_is_refused(manifold):
     with pytest.raises(PriorError, match="30"):
         ManifoldParticleFilter(BODY, manifold, fps=30.0)
     unfinished = fit_gplvm(BODY.relative(walk(BODY, 40)), steps=1)
-    with pytest.raises(PriorError, match="fit_noise"):
+    with pytest.raises(PriorError, match="fit_gplvm_noise"):
         ManifoldParticleFilter(BODY, unfinished)
 
 

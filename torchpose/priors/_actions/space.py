@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -116,64 +115,12 @@ class ActionSpace(nn.Module):
                 raise InputError(f"{name} must be positive, degrees, got {float(value.min()):g}")
             self.register_buffer(name, value)
 
-    @classmethod
-    def fit(
-        cls,
-        performances: Sequence[Float[Tensor, "_ 36"]],
-        n_dimensions: int = 13,
-        *,
-        name: str = "",
-        fps: float | None = None,
-        n_postures: int | None = None,
-        prominence: float = 0.15,
-        info: ActionInfo | None = None,
-    ) -> "ActionSpace":
-        """Fit an action. Deprecated: `torchpose.learning.fit_action_space` takes the same arguments.
-
-        Args:
-            performances, n_dimensions, name, fps, n_postures, prominence, info: as
-                `torchpose.learning.fit_action_space`.
-
-        Returns:
-            What that returns.
-        """
-        # learning is a layer above: until this goes, it is looked up by its name
-        fit = moved_function("ActionSpace.fit", "torchpose.learning.fit_action_space")
-        space: ActionSpace = fit(
-            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
-            prominence=prominence, info=info,
-        )  # fmt: skip
-        return space
-
-    @classmethod
-    def fit_synchronised(
-        cls,
-        performances: Sequence[Float[Tensor, "_ 36"]],
-        n_dimensions: int = 13,
-        *,
-        name: str = "",
-        fps: float | None = None,
-        n_postures: int | None = None,
-        prominence: float = 0.15,
-        info: ActionInfo | None = None,
-    ) -> tuple["ActionSpace", Any]:
-        """Fit an action. Deprecated: `torchpose.learning._action_spaces.fit_synchronised`.
-
-        Args:
-            performances, n_dimensions, name, fps, n_postures, prominence, info: as
-                `torchpose.learning._action_spaces.fit_synchronised`.
-
-        Returns:
-            What that returns.
-        """
-        # as in `fit`
-        home = "torchpose.learning._action_spaces.fit_synchronised"
-        fit = moved_function("ActionSpace.fit_synchronised", home)
-        found: tuple[ActionSpace, Any] = fit(
-            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
-            prominence=prominence, info=info,
-        )  # fmt: skip
-        return found
+    fit = staticmethod(moved_function("ActionSpace.fit", "torchpose.learning.fit_action_space"))
+    fit_synchronised = staticmethod(
+        moved_function(
+            "ActionSpace.fit_synchronised", "torchpose.learning._action_spaces.fit_synchronised"
+        )
+    )
 
     # --- sizes ------------------------------------------------------------------------------------
 

@@ -181,62 +181,8 @@ class BackConstrainedGPLVM(nn.Module):
         self.register_load_state_dict_post_hook(_prepare_again)
         self._prepare()
 
-    # --- fit
-
-    @classmethod
-    def fit(
-        cls,
-        poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
-        latent_dim: int = 2,
-        *,
-        gamma_x: float | None = None,
-        steps: int | None = None,
-        seed: int = 0,
-        optimiser: str = "lbfgs",
-        learning_rate: float | None = None,
-        tolerance: float = 1e-5,
-        n_init: int | None = None,
-        smoothness: float = 0.0,
-        standardise: bool = False,
-        validation: Float[Tensor, "V Q"] | Sequence[Float[Tensor, "_ Q"]] | None = None,
-        patience: int = 3,
-        info: ManifoldInfo | None = None,
-        progress: bool = False,
-    ) -> BackConstrainedGPLVM:
-        """Fit a manifold. Deprecated: `torchpose.learning.fit_gplvm` takes the same arguments.
-
-        Args:
-            poses, latent_dim, gamma_x, steps, seed, optimiser, learning_rate, tolerance, n_init, smoothness,
-                standardise, validation, patience, info, progress: as `torchpose.learning.fit_gplvm`.
-
-        Returns:
-            What that returns.
-        """
-        # learning is a layer above: until this goes, it is looked up by its name
-        fit = moved_function("BackConstrainedGPLVM.fit", "torchpose.learning.fit_gplvm")
-        manifold: BackConstrainedGPLVM = fit(
-            poses, latent_dim, gamma_x=gamma_x, steps=steps, seed=seed, optimiser=optimiser,
-            learning_rate=learning_rate, tolerance=tolerance, n_init=n_init, smoothness=smoothness,
-            standardise=standardise, validation=validation, patience=patience, info=info,
-            progress=progress,
-        )  # fmt: skip
-        return manifold
-
-    def fit_noise(
-        self, poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]], fps: float
-    ) -> BackConstrainedGPLVM:
-        """Set the noise. Deprecated: `torchpose.learning.fit_gplvm_noise`, with the manifold first.
-
-        Args:
-            poses, fps: as `torchpose.learning.fit_gplvm_noise`.
-
-        Returns:
-            This manifold.
-        """
-        # as in `fit`
-        fit = moved_function("fit_noise", "torchpose.learning.fit_gplvm_noise")
-        manifold: BackConstrainedGPLVM = fit(self, poses, fps)
-        return manifold
+    fit = staticmethod(moved_function("BackConstrainedGPLVM.fit", "torchpose.learning.fit_gplvm"))
+    fit_noise = moved_function("fit_noise", "torchpose.learning.fit_gplvm_noise")
 
     def at_rate(self, fps: float) -> BackConstrainedGPLVM:
         """Return the same manifold with its standard deviations for another frame rate.

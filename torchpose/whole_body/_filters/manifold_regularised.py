@@ -228,5 +228,5 @@ def _check_noise(manifold: PoseManifold, n_columns: int) -> None:
         check_shape(f"{name} of the manifold", std, [size])
         if not bool(torch.isfinite(std).all()):
             raise PriorError(
-                f"the manifold has no {name} yet; call its fit_noise with validation poses"
+                f"the manifold has no {name} yet; call fit_gplvm_noise with it and validation poses"
             )
