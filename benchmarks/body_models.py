@@ -6,7 +6,7 @@ without a model, and two estimates that do not look: standing still, and the mea
 the true place. Errors are distances of joints.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.bodies.clips import Split, take_frames
+from benchmarks.bodies.clips import Split, select_persons, take_frames
 from benchmarks.bodies.tracking import (
     MADE_WITH,
     Run,
@@ -37,12 +37,11 @@ from benchmarks.bodies.views import (
 from benchmarks.engine import Experiment, Grid, Results, Row, mean, pivot, spread, write_csv
 from torchpose._core.files import check_output_folder
 from torchpose.body import fit_state
-from torchpose.errors import InputError
+from torchpose.errors import InputError, OverlapError
 from torchpose.evaluation import Report
 from torchpose.io import read_mocap
-from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.io._mocap import MocapClip
 from torchpose.priors import load_action, load_limb_conditionals, load_manifold
-from torchpose.priors._shipped import persons_of_model, refuse_seen
 from torchpose.whole_body import METHODS, BodyTracker
 
 STILL, MEAN_POSE = "standing still", "mean pose at the true place"
@@ -151,6 +150,25 @@ def _load(manifold: str | None, conditionals: str | None, action: str | None) ->
     if not found:
         raise InputError("name a model: --manifold, --conditionals or --action, NAME or FILE")
     return found
+
+
+def persons_of_model(model: Any) -> set[str]:
+    """Return ids of all persons that a model was fitted to, or held out for a manifold's noise."""
+    return {*model.info.persons, *model.info.extra.get("held_out_persons", ())}
+
+
+def refuse_seen(model: Any, persons: Collection[str]) -> None:
+    """Raise `OverlapError` if a model has anything of one of these persons.
+
+    Args:
+        model: any with `info`. persons: ids, as `Recording.person_id`.
+    """
+    seen = sorted(set(persons) & persons_of_model(model))
+    if seen:
+        raise OverlapError(
+            f"the model {model.info.name!r} was fitted on {', '.join(seen)}; score it on other "
+            "persons, or fit one without these"
+        )
 
 
 def _unseen(

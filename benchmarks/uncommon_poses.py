@@ -6,8 +6,9 @@ that what is missing can be told from how much is missing. All of them track the
 """
 
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,11 +21,10 @@ from torchpose.evaluation._person_tables import (
     add_pose_classes,
     class_error,
     mean_error,
-    plot_pose_classes,
     pooled,
 )
 from torchpose.evaluation._trials import Recipe, add_picture
-from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior
 
@@ -100,6 +100,34 @@ def run(
     add_picture(report, out, "uncommon-poses.png", plot_pose_classes(scored, title))
     report.save(out)
     return report
+
+
+def plot_pose_classes(groups: Mapping[str, Scored], title: str) -> Any:
+    """Draw the error of hands and elbows by what the arm does, a bar for each group."""
+    from matplotlib.patches import Patch
+
+    from torchpose.viz._style import add_legend, method_styles, new_figure, style_axes
+
+    figure = new_figure(7.6, 3.9, title)
+    ax = style_axes(figure.add_subplot(), y="mean error of hand and elbow (cm)")
+    ax.grid(False, axis="x")
+    styles = method_styles(list(groups))
+    width = 0.8 / len(groups)
+    entries = []
+    for i, (group, scored) in enumerate(groups.items()):
+        values = [class_error(scored, name) for name in POSE_CLASSES]
+        place = torch.arange(len(values)).double().numpy() - 0.4 + (i + 0.5) * width
+        ax.bar(place, values, 0.9 * width, color=styles[group]["color"], alpha=0.85)
+        entries.append(Patch(color=styles[group]["color"], alpha=0.85, label=group))
+    shares = [
+        100 * float((next(iter(groups.values())).classes == i).double().mean())
+        for i in range(len(POSE_CLASSES))
+    ]
+    labels = [f"{name}\n{share:.0f} %" for name, share in zip(POSE_CLASSES, shares, strict=True)]
+    ax.set_xticks(range(len(POSE_CLASSES)), labels)
+    ax.set_ylim(bottom=0)
+    add_legend(figure, entries)
+    return figure
 
 
 def raised_share(recording: Recording) -> float:

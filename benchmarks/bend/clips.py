@@ -5,9 +5,9 @@ A recording holds several bends; a performance is one of them, from upright to u
 
 from collections.abc import Sequence
 
-from benchmarks.bodies.clips import Split
+from benchmarks.bodies.clips import Split, select_persons
 from torchpose.errors import InputError
-from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.io._mocap import MocapClip
 from torchpose.learning import split_repetitions
 from torchpose.priors import posture_angles
 

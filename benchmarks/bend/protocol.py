@@ -42,6 +42,7 @@ from benchmarks.bend.variants import (
     prepare,
     synchronised_space,
 )
+from benchmarks.bodies.clips import select_persons
 from benchmarks.bodies.views import Conditions, Subject, image_size, view_of
 from benchmarks.engine import Grid, Results, Setting, Tuning, write_csv
 from benchmarks.engine.tuning import SCALES
@@ -50,7 +51,7 @@ from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation._trials import add_picture
 from torchpose.io import read_mocap
-from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.io._mocap import MocapClip
 
 FPS = 30.0
 PARTS = ("particles", "dimensions", "limbs", "occlusion", "actions")

@@ -1,6 +1,7 @@
 """Recorded clips: splits into training, validation and test, and the places of the cameras."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 from torchpose.demo._rendering.walk import AZIMUTHS, cameras_around
 from torchpose.errors import InputError
-from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.io._mocap import MocapClip
 
 LEAST_FRAMES = 110
 """A test trial should have as many; a shorter one is taken where there is no other."""
@@ -37,6 +38,40 @@ class Split(NamedTuple):
     validation: tuple[MocapClip, ...]
     body: tuple[MocapClip, ...]
     seen: bool
+
+
+def select_persons(
+    clips: Sequence[MocapClip], persons: Sequence[str]
+) -> dict[str, list[MocapClip]]:
+    """Return the clips by person, in the order asked for; ``07``, ``7`` and ``s07`` are the same person.
+
+    Args:
+        persons: their names; all persons if empty.
+
+    Raises:
+        InputError: nobody of that name; the names that are there are listed.
+    """
+    by_key: dict[str, list[MocapClip]] = {}
+    for clip in clips:
+        by_key.setdefault(_person_key(clip.person), []).append(clip)
+    found = {}
+    for name in persons or dict.fromkeys(clip.person for clip in clips):
+        group = by_key.get(_person_key(name))
+        if group is None:
+            there = ", ".join(dict.fromkeys(clip.person for clip in clips))
+            raise InputError(f"expected recordings of person {name}; there are those of {there}")
+        found[group[0].person] = group
+    return found
+
+
+def _person_key(name: str) -> str:
+    """Return the number of a person whose name is one, else the name in lower case.
+
+    >>> _person_key("s07") == _person_key("7") == _person_key("07")
+    True
+    """
+    match = re.fullmatch(r"[A-Za-z]?0*(\d+)", name.strip())
+    return match[1] if match else name.strip().lower()
 
 
 def split_clips(

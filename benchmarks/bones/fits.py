@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.bones.arm_prior_fit import fit_arm_prior
 from benchmarks.bones.views import recordings
-from torchpose.learning._arm_prior_fit import fit_arm_prior
 from torchpose.priors._arms import ArmPrior
 
 SETS = {

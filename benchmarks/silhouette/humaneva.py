@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks.bodies.clips import Split, take_frames, whole_frames
+from benchmarks.bodies.clips import Split, select_persons, take_frames, whole_frames
 from benchmarks.engine import kept_runs, source_hash
 from benchmarks.humaneva_files import FPS, PARTITIONS, HumanEvaTrial, find_humaneva, read_humaneva
 from torchpose.camera import CameraRig
 from torchpose.errors import InputError
-from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.io._mocap import MocapClip
 from torchpose.video import SilhouetteMeasurer, VideoSource, open_video, read_silhouettes
 from torchpose.video._silhouettes import SilhouetteView, clean_silhouette, fit_view, learning_frames
 

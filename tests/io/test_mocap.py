@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.bodies.clips import select_persons
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.errors import InputError
-from torchpose.io._mocap import read_mocap, resample_frames, select_persons
+from torchpose.io._mocap import read_mocap, resample_frames
 from torchpose.skeleton import SKELETONS
 from torchpose.skeleton._joint_sets import canonical_names
 

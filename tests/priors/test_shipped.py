@@ -1,7 +1,6 @@
 """Models of whole bodies that come with the package: files, cards, configurations, and who is refused."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,10 +10,10 @@ from tests.data import data_dir_or_skip
 from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
 from torchpose.cli._fit_bodies import command
-from torchpose.errors import OverlapError, PriorError
+from torchpose.errors import PriorError
 from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models
-from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, load_body_motion, refuse_seen
+from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, load_body_motion
 
 ROOT = Path(__file__).parents[2]
 LOADERS = {
@@ -117,12 +116,3 @@ def test_names_and_files(tmp_path):
         load_manifold("run")
     with pytest.raises(PriorError, match="an action space or bank"):
         load_action("walk")
-
-
-def test_persons_whom_a_model_knows_are_refused():
-    info = SimpleNamespace(name="m", persons=("a#1",), extra={"held_out_persons": ["a#2"]})
-    model = SimpleNamespace(info=info)
-    refuse_seen(model, ["a#3", "b#1"])
-    for person in ("a#1", "a#2"):
-        with pytest.raises(OverlapError, match=f"'m' was fitted on {person}"):
-            refuse_seen(model, ["a#3", person])

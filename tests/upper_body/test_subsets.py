@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import torchpose
+from benchmarks.bones.arm_prior_fit import fit_arm_prior
 from tests.data import few_recordings
 from torchpose.camera._projection import project
 from torchpose.io import read_recordings
-from torchpose.learning._arm_prior_fit import fit_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
 

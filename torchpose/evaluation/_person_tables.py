@@ -19,7 +19,6 @@ __all__ = [
     "mean_error",
     "plot_curves",
     "plot_persons",
-    "plot_pose_classes",
     "pooled",
 ]
 
@@ -185,33 +184,5 @@ def plot_curves(curves: Mapping[str, Mapping[str, Curve]], title: str) -> Any:
     ]
     entries.append(Line2D([], [], color=INK, linewidth=1.4, label="± SD over who was trained on"))
     entries.append(Patch(color=PALE, alpha=0.5, label="± SD over who was tracked"))
-    add_legend(figure, entries)
-    return figure
-
-
-def plot_pose_classes(groups: Mapping[str, Scored], title: str) -> Any:
-    """Draw the error of hands and elbows by what the arm does, a bar for each group."""
-    from matplotlib.patches import Patch
-
-    from torchpose.viz._style import add_legend, method_styles, new_figure, style_axes
-
-    figure = new_figure(7.6, 3.9, title)
-    ax = style_axes(figure.add_subplot(), y="mean error of hand and elbow (cm)")
-    ax.grid(False, axis="x")
-    styles = method_styles(list(groups))
-    width = 0.8 / len(groups)
-    entries = []
-    for i, (group, scored) in enumerate(groups.items()):
-        values = [class_error(scored, name) for name in POSE_CLASSES]
-        place = torch.arange(len(values)).double().numpy() - 0.4 + (i + 0.5) * width
-        ax.bar(place, values, 0.9 * width, color=styles[group]["color"], alpha=0.85)
-        entries.append(Patch(color=styles[group]["color"], alpha=0.85, label=group))
-    shares = [
-        100 * float((next(iter(groups.values())).classes == i).double().mean())
-        for i in range(len(POSE_CLASSES))
-    ]
-    labels = [f"{name}\n{share:.0f} %" for name, share in zip(POSE_CLASSES, shares, strict=True)]
-    ax.set_xticks(range(len(POSE_CLASSES)), labels)
-    ax.set_ylim(bottom=0)
     add_legend(figure, entries)
     return figure

@@ -4,7 +4,6 @@
 has axes of its own, so here they are those of the file, in metres.
 """
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording, read_recordings
 
-__all__ = ["MocapClip", "read_mocap", "resample_frames", "select_persons"]
+__all__ = ["MocapClip", "read_mocap", "resample_frames"]
 
 _UNNAMED = "unnamed"
 
@@ -86,30 +85,6 @@ def read_mocap(
     return [_clip(recording, fps) for recording in wanted]
 
 
-def select_persons(
-    clips: Sequence[MocapClip], persons: Sequence[str]
-) -> dict[str, list[MocapClip]]:
-    """Return the clips by person, in the order asked for; ``07``, ``7`` and ``s07`` are the same person.
-
-    Args:
-        persons: their names; all persons if empty.
-
-    Raises:
-        InputError: nobody of that name; the names that are there are listed.
-    """
-    by_key: dict[str, list[MocapClip]] = {}
-    for clip in clips:
-        by_key.setdefault(_person_key(clip.person), []).append(clip)
-    found = {}
-    for name in persons or dict.fromkeys(clip.person for clip in clips):
-        group = by_key.get(_person_key(name))
-        if group is None:
-            there = ", ".join(dict.fromkeys(clip.person for clip in clips))
-            raise InputError(f"expected recordings of person {name}; there are those of {there}")
-        found[group[0].person] = group
-    return found
-
-
 def resample_frames(
     points: Float[Tensor, "T *rest"], fps: float, target: float
 ) -> Float[Tensor, "S *rest"]:
@@ -171,13 +146,3 @@ def _clip(recording: Recording, fps: float | None) -> MocapClip:
         words[0] if words else _UNNAMED, recording.action,
         recording.path.stem if recording.path is not None else "", recording.person_id,
     )  # fmt: skip
-
-
-def _person_key(name: str) -> str:
-    """Return the number of a person whose name is one, else the name in lower case.
-
-    >>> _person_key("s07") == _person_key("7") == _person_key("07")
-    True
-    """
-    match = re.fullmatch(r"[A-Za-z]?0*(\d+)", name.strip())
-    return match[1] if match else name.strip().lower()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 from torchpose._core.tensor_file import format_of
-from torchpose.errors import OverlapError, PriorError
+from torchpose.errors import PriorError
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._body_motion import BodyMotion
@@ -22,8 +20,6 @@ __all__ = [
     "load_body_motion",
     "load_limb_conditionals",
     "load_manifold",
-    "persons_of_model",
-    "refuse_seen",
 ]
 
 WEIGHTS = Path(__file__).parent.parent / "weights"
@@ -142,24 +138,3 @@ def load_body_motion(name_or_path: str | Path) -> BodyMotion:
     30.0
     """
     return BodyMotion.load(find_model("bodies", name_or_path))
-
-
-def persons_of_model(model: Any) -> set[str]:
-    """Return ids of all persons that a model was fitted to, or held out for a manifold's noise."""
-    return {*model.info.persons, *model.info.extra.get("held_out_persons", ())}
-
-
-def refuse_seen(model: Any, persons: Collection[str], name: str = "") -> None:
-    """Raise `OverlapError` if a model has anything of one of these persons.
-
-    Args:
-        model: any with `info`. persons: ids, as `Recording.person_id`. name: of the model, if it does
-            not say.
-    """
-    seen = sorted(set(persons) & persons_of_model(model))
-    if seen:
-        named = getattr(model.info, "name", "") or name
-        raise OverlapError(
-            f"the model {named!r} was fitted on {', '.join(seen)}; score it on other persons, or fit "
-            "one without these"
-        )

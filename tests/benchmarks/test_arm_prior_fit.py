@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from benchmarks.bones.arm_prior_fit import arm_directions, fit_arm_prior
 from torchpose.demo import performer
 from torchpose.errors import InputError
 from torchpose.io import Recording
-from torchpose.learning._arm_prior_fit import arm_directions, fit_arm_prior
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
