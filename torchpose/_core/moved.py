@@ -1,6 +1,6 @@
 """Keep old names working for one release, with a `DeprecationWarning`: modules, names, arguments.
 
-`MODULES`, `NAMES` and `ARGUMENTS` are the whole table. All are to go in version 0.3.0.
+`_MODULES`, `NAMES` and `ARGUMENTS` are the whole table. All are to go in version 0.3.0.
 """
 
 import sys
@@ -27,211 +27,119 @@ __all__ = [
 _PACKAGE = Path(__file__).parents[1]
 _BETWEEN = {"torchpose", "torch", "importlib"}  # packages between a program and a warning
 
-MODULES = {
-    "arm_filters": "upper_body._single_poses",
-    "arm_windows": "upper_body._windows",
-    "arms": "upper_body._estimator",
-    "body.body_parameters": "body._limbs",
-    "body.limb_batches": "whole_body._silhouettes.limb_batches",
-    "body.limb_counts": "whole_body._silhouettes.limb_counts",
-    "body.limb_outlines": "whole_body._silhouettes.outlines",
-    "body.quaternion_vectors": "math._rotations",
-    "body.rectangles": "whole_body._silhouettes.outlines",
-    "body.row_intervals": "whole_body._silhouettes.outlines",
-    "body.shape": "whole_body._silhouettes.shape",
-    "body.silhouette": "whole_body._silhouettes.rendering",
-    "body.silhouette_likelihood": "whole_body._silhouettes.likelihood",
-    "body_poses": "whole_body._body_track",
-    "body_tracking": "whole_body._body_tracker",
-    "body_view": "camera._virtual_camera",
-    "calibration": "metrics._calibration",
-    "camera_rig": "camera._rig",
-    "cli.camera_option": "camera._choice",
-    "cli.pose_csv": "upper_body._pose_files",
-    "cli.prior_files": "learning._fit_files",
-    "collapse": "upper_body._reading",
-    "curation": "learning._curation",
-    "filters.annealed": "whole_body._filters.annealed",
-    "filters.base": "filters._recursive_filter",
-    "filters.body_frames": "whole_body._filters.body_frames",
-    "filters.body_particles": "whole_body._filters.body_particles",
-    "filters.constrained": "whole_body._filters.constrained",
-    "filters.first_order": "whole_body._filters.motion",
-    "filters.first_pose": "whole_body._first_pose",
-    "filters.frame_weights": "filters._memoryless",
-    "filters.gains": "filters._gain_graph",
-    "filters.gamma": "filters._transition",
-    "filters.geometric_median": "math._geometric_median",
-    "filters.joint_spread": "whole_body._filters.body_particles",
-    "filters.leg_swap": "whole_body._filters.legs",
-    "filters.limb_observations": "whole_body._filters.limb_observations",
-    "filters.manifold": "whole_body._filters.manifold_regularised",
-    "filters.mending": "filters._outputs",
-    "filters.particle_options": "filters._particle",
-    "filters.pose_search": "whole_body._pose_search",
-    "filters.posture_gate": "whole_body._filters.posture_gate",
-    "filters.redraw": "whole_body._filters.posture_gate",
-    "filters.root_uncertainty": "whole_body._filters.root_uncertainty",
-    "filters.scan": "filters._shared_gains",
-    "filters.sharpness": "whole_body._sharpness",
-    "filters.silhouette_filter": "whole_body._filters.silhouette_filter",
-    "filters.sir": "whole_body._filters.sir",
-    "filters.survival": "filters._resampling",
-    "filters.tracks": "filters._mkf",
-    "filters.tree_messages": "math._tree_messages",
-    "gaussian": "math._gaussian",
-    "io.axes": "io._formats.axes",
-    "io.azure_json": "io._formats.skeleton_files",
-    "io.bvh": "upper_body._pose_files",
-    "io.bvh_recordings": "io._formats.mocap_files",
-    "io.c3d_recordings": "io._formats.mocap_files",
-    "io.estimates": "_core.estimates",
-    "io.fields": "_core.reading",
-    "io.files": "_core.files",
-    "io.kinect_csv": "io._formats.kinect_csv",
-    "io.kinect_v1": "io._formats.skeleton_files",
-    "io.landmarks": "skeleton._mediapipe_landmarks",
-    "io.leftovers": "_core.files",
-    "io.npz": "_core.reading",
-    "io.npz_recordings": "io._formats.raw_recording",
-    "io.ntu_skeleton": "io._formats.skeleton_files",
-    "io.openpose": "io._formats.openpose",
-    "io.raw_recording": "io._formats.raw_recording",
-    "io.reading": "_core.reading",
-    "io.units": "io._formats.axes",
-    "joint_sets": "skeleton._joint_sets",
-    "lifting": "camera._projection",
-    "mannequin": "demo._mannequin",
-    "measure.face_memory": "measure._head",
-    "measure.hand_measurements": "measure._hand_likelihood",
-    "measure.hand_settings": "measure._hand_likelihood",
-    "measure.head_neck": "measure._head",
-    "measure.motion": "measure._background",
-    "measure.silhouettes": "video._silhouettes",
-    "measure.torso": "measure._torso_elbows",
-    "measure.upper_body": "measure._upper_body_measurer",
-    "measurements": "upper_body._measured_joints",
-    "methods": "upper_body._estimator_table",
-    "metric_arguments": "_core.arguments",
-    "module_state": "_core.module_state",
-    "person_stream": "video._person_stream",
-    "pose_spool": "video._recording",
-    "pose_track": "upper_body._pose_track",
-    "priors.action_bank": "priors._actions.bank",
-    "priors.action_chain": "priors._actions.stack",
-    "priors.action_file": "priors._actions.action_file",
-    "priors.action_fit": "learning._action_spaces",
-    "priors.action_gate": "priors._actions.gate",
-    "priors.action_recognition": "learning._action_spaces",
-    "priors.action_space": "priors._actions.space",
-    "priors.action_stack": "priors._actions.stack",
-    "priors.body_card": "learning._model_card",
-    "priors.completion": "learning._streamed_em",
-    "priors.em": "math._mixture_em",
-    "priors.features": "math._mixture_steps",
-    "priors.fine_tuning": "learning._fine_tuning",
-    "priors.gmm": "priors._gaussian_mixture",
-    "priors.gplvm": "priors._manifold.gplvm",
-    "priors.gplvm_fit": "learning._gplvm_fit",
-    "priors.gplvm_kernel": "priors._manifold.prediction",
-    "priors.gplvm_noise": "learning._manifolds",
-    "priors.gplvm_prediction": "priors._manifold.prediction",
-    "priors.increments": "learning._upper_body_prior_fit",
-    "priors.manifold_file": "priors._manifold.manifold_file",
-    "priors.model_card": "learning._model_card",
-    "priors.neck": "skeleton._torso",
-    "priors.part_postures": "priors._actions.part_postures",
-    "priors.polar_limbs": "priors._actions.polar_limbs",
-    "priors.pose_sequences": "learning._manifolds",
-    "priors.postures": "priors._actions.postures",
-    "priors.prior_noise": "priors._prior_file",
-    "priors.repetitions": "learning._performances",
-    "priors.samplers": "learning._samplers",
-    "priors.seen_keypoints": "learning._training",
-    "priors.selection": "learning._selection",
-    "priors.share": "learning._blocks",
-    "priors.start": "math._mixture_start",
-    "priors.stepwise_em": "learning._stepwise_em",
-    "priors.streamed_em": "learning._streamed_em",
-    "priors.synchronisation": "learning._performances",
-    "priors.tensor_file": "_core.tensor_file",
-    "priors.training": "learning._training",
-    "priors.upper_body": "priors._upper_body_prior",
-    "priors.usable_samples": "learning._blocks",
-    "process_noise": "upper_body._single_poses",
-    "projection": "camera._projection",
-    "protocols": "evaluation",
-    "protocols.common": "evaluation._trials",
-    "protocols.persons": "evaluation._person_recordings",
-    "read_out": "upper_body._fusion",
-    "recipes": "learning._recipes",
-    "recording": "video._recording",
-    "rendering": "demo._rendering",
-    "rendering.portrait": "demo._rendering.look",
-    "report": "viz._report",
-    "rotation_gaussians": "math._rotation_gaussians",
-    "rotations": "math._rotations",
-    "streaming": "upper_body._live_pose",
-    "torchmetrics_adapters": "metrics._torchmetrics_adapters",
-    "torso": "skeleton._torso",
-    "tracking": "upper_body._upper_body_tracker",
-    "unscented": "math._unscented",
-    "value_checks": "_core.value_checks",
-    "video.base": "video._source_interface",
-    "video.body_overlay": "video._overlay",
-    "video.live": "video._live_view",
-    "video.pen": "video._overlay",
-    "video.probe": "video._timing",
-    "video_tracker": "video._video_tracker",
-    "viewpoints": "camera._viewpoints",
-    "viz.action_picture": "viz._model_pictures",
-    "viz.manifold_picture": "viz._model_pictures",
+_MODULES = {
+    "": "protocols=evaluation",
+    "_core": (
+        "io.estimates io.fields=reading io.files io.leftovers=files io.npz=reading io.reading "
+        "metric_arguments=arguments module_state priors.tensor_file value_checks"
+    ),
+    "body": "body.body_parameters=_limbs",
+    "camera": (
+        "body_view=_virtual_camera camera_rig=_rig cli.camera_option=_choice lifting=_projection "
+        "projection viewpoints"
+    ),
+    "demo": "mannequin rendering",
+    "demo._rendering": "rendering.portrait=look",
+    "evaluation": "protocols.common=_trials protocols.persons=_person_recordings",
+    "filters": (
+        "filters.base=_recursive_filter filters.frame_weights=_memoryless "
+        "filters.gains=_gain_graph filters.gamma=_transition filters.mending=_outputs "
+        "filters.particle_options=_particle filters.scan=_shared_gains "
+        "filters.survival=_resampling filters.tracks=_mkf"
+    ),
+    "io._formats": (
+        "io.axes io.azure_json=skeleton_files io.bvh_recordings=mocap_files "
+        "io.c3d_recordings=mocap_files io.kinect_csv io.kinect_v1=skeleton_files "
+        "io.npz_recordings=raw_recording io.ntu_skeleton=skeleton_files io.openpose "
+        "io.raw_recording io.units=axes"
+    ),
+    "learning": (
+        "cli.prior_files=_fit_files curation priors.action_fit=_action_spaces "
+        "priors.action_recognition=_action_spaces priors.body_card=_model_card "
+        "priors.completion=_streamed_em priors.fine_tuning priors.gplvm_fit "
+        "priors.gplvm_noise=_manifolds priors.increments=_upper_body_prior_fit priors.model_card "
+        "priors.pose_sequences=_manifolds priors.repetitions=_performances priors.samplers "
+        "priors.seen_keypoints=_training priors.selection priors.share=_blocks priors.stepwise_em "
+        "priors.streamed_em priors.synchronisation=_performances priors.training "
+        "priors.usable_samples=_blocks recipes"
+    ),
+    "math": (
+        "body.quaternion_vectors=_rotations filters.geometric_median filters.tree_messages "
+        "gaussian priors.em=_mixture_em priors.features=_mixture_steps "
+        "priors.start=_mixture_start rotation_gaussians rotations unscented"
+    ),
+    "measure": (
+        "measure.face_memory=_head measure.hand_measurements=_hand_likelihood "
+        "measure.hand_settings=_hand_likelihood measure.head_neck=_head "
+        "measure.motion=_background measure.torso=_torso_elbows "
+        "measure.upper_body=_upper_body_measurer"
+    ),
+    "metrics": "calibration torchmetrics_adapters",
+    "priors": (
+        "priors.gmm=_gaussian_mixture priors.prior_noise=_prior_file "
+        "priors.upper_body=_upper_body_prior"
+    ),
+    "priors._actions": (
+        "priors.action_bank=bank priors.action_chain=stack priors.action_file "
+        "priors.action_gate=gate priors.action_space=space priors.action_stack=stack "
+        "priors.part_postures priors.polar_limbs priors.postures"
+    ),
+    "priors._manifold": (
+        "priors.gplvm priors.gplvm_kernel=prediction priors.gplvm_prediction=prediction "
+        "priors.manifold_file"
+    ),
+    "skeleton": "io.landmarks=_mediapipe_landmarks joint_sets priors.neck=_torso torso",
+    "upper_body": (
+        "arm_filters=_single_poses arm_windows=_windows arms=_estimator cli.pose_csv=_pose_files "
+        "collapse=_reading io.bvh=_pose_files measurements=_measured_joints "
+        "methods=_estimator_table pose_track process_noise=_single_poses read_out=_fusion "
+        "streaming=_live_pose tracking=_upper_body_tracker"
+    ),
+    "video": (
+        "measure.silhouettes person_stream pose_spool=_recording recording "
+        "video.base=_source_interface video.body_overlay=_overlay video.live=_live_view "
+        "video.pen=_overlay video.probe=_timing video_tracker"
+    ),
+    "viz": "report viz.action_picture=_model_pictures viz.manifold_picture=_model_pictures",
+    "whole_body": (
+        "body_poses=_body_track body_tracking=_body_tracker filters.first_pose "
+        "filters.pose_search filters.sharpness"
+    ),
+    "whole_body._filters": (
+        "filters.annealed filters.body_frames filters.body_particles filters.constrained "
+        "filters.first_order=motion filters.joint_spread=body_particles filters.leg_swap=legs "
+        "filters.limb_observations filters.manifold=manifold_regularised filters.posture_gate "
+        "filters.redraw=posture_gate filters.root_uncertainty filters.silhouette_filter "
+        "filters.sir"
+    ),
+    "whole_body._silhouettes": (
+        "body.limb_batches body.limb_counts body.limb_outlines=outlines body.rectangles=outlines "
+        "body.row_intervals=outlines body.shape body.silhouette=rendering "
+        "body.silhouette_likelihood=likelihood"
+    ),
 }
-"""Old module to present module, both without `torchpose.`; submodules follow their package.
+"""Present package (without `torchpose.`) to the old paths of modules that are in it now.
 
-A module that only became private (`filters.mkf` is `filters._mkf`) does not stand here.
+A module keeps its file name, with an underscore in a room; one whose name has changed is OLD=NEW. Submodules
+follow their package. A module that only became private (`filters.mkf` is `filters._mkf`) does not stand here.
 """
 
-LABORATORY = frozenset(
-    [
-        "body.faults",
-        "io.humaneva",
-        "io.humaneva_joints",
-        "protocols.bend",
-        "protocols.bend_actions",
-        "protocols.bend_data",
-        "protocols.bend_occlusion",
-        "protocols.bend_pictures",
-        "protocols.bend_runs",
-        "protocols.bend_tables",
-        "protocols.bend_trackees",
-        "protocols.body_models",
-        "protocols.gaps",
-        "protocols.kept_runs",
-        "protocols.one_tables",
-        "protocols.people_tables",
-        "protocols.root_uncertainty",
-        "protocols.root_uncertainty_pictures",
-        "protocols.root_uncertainty_runs",
-        "protocols.root_uncertainty_search",
-        "protocols.root_uncertainty_tables",
-        "protocols.root_uncertainty_trackees",
-        "protocols.signer",
-        "protocols.silhouette",
-        "protocols.silhouette_data",
-        "protocols.silhouette_humaneva",
-        "protocols.silhouette_pictures",
-        "protocols.silhouette_report",
-        "protocols.silhouette_runs",
-        "protocols.silhouette_tables",
-        "protocols.silhouette_trackees",
-        "protocols.ub_one",
-        "protocols.ub_people",
-        "protocols.uncommon_poses",
-        "rendering.performances",
-    ]
-)
-"""Modules that belong to the benchmarks of a checkout now, and are no part of the package."""
+
+def _present_modules() -> dict[str, str]:
+    found = {}
+    for home, paths in _MODULES.items():
+        private = "" if "._" in f".{home}" else "_"
+        for path in paths.split():
+            old, _, new = path.partition("=")
+            found[old] = f"{home}.{new or private + old.rpartition('.')[2]}".lstrip(".")
+    return found
+
+
+MODULES = _present_modules()
+"""Old module to present module, both without `torchpose.`."""
+
+_LABORATORY = ("body.faults", "io.humaneva", "io.humaneva_joints", "rendering.performances")
+"""Modules that belong to the benchmarks of a checkout now, beside most of `protocols`."""
 
 NAMES: dict[str, dict[str, str]] = {
     "torchpose": {
@@ -284,10 +192,6 @@ NAMES: dict[str, dict[str, str]] = {
         "io._formats.axes": "AXES",
         "io._recordings": "find_recordings",
         "io._results": "ResultsFolder",
-    },
-    "torchpose.learning": {
-        "learning._model_card": "model_card write_model_card",
-        "learning._training": "arm_sources collect_poses",
     },
     "torchpose.math": {
         "math._gaussian": (
@@ -355,9 +259,6 @@ NAMES: dict[str, dict[str, str]] = {
             "mirror_pose scale_bones"
         ),
     },
-    "torchpose.upper_body": {
-        "upper_body._live_pose": "StreamState",
-    },
     "torchpose.upper_body._fusion": {
         "upper_body._fusion": "MotionState=MotionStageState",
     },
@@ -374,17 +275,6 @@ NAMES: dict[str, dict[str, str]] = {
     },
     "torchpose.viz": {
         "viz._prior_pictures": "plot_log_likelihood plot_prior_components plot_prior_samples",
-    },
-    "torchpose.whole_body": {
-        "whole_body": "BodyPoses=BodyTrack",
-        "whole_body._filters.body_particles": "BodyFilterState joint_covariance",
-        "whole_body._first_pose": "FirstPose",
-        "whole_body._sharpness": "ValidationSequence",
-        "whole_body._silhouettes.likelihood": "intersection_over_union",
-        "whole_body._silhouettes.rendering": (
-            "PreparedSilhouettes SilhouetteCounts prepare_silhouettes render_limbs"
-        ),
-        "whole_body._silhouettes.shape": "fit_radii",
     },
     "torchpose.whole_body._body_track": {
         "whole_body._body_track": "BodyPoses=BodyTrack",
@@ -436,6 +326,14 @@ def present_module(old: str) -> str | None:
     if (_PACKAGE.joinpath(*folder) / f"_{name}.py").is_file():
         return ".".join(["torchpose", *folder, f"_{name}"])
     return None
+
+
+def _is_of_laboratory(old: str) -> bool:
+    """Return whether a module went to the benchmarks, as all former protocols but those in `evaluation`."""
+    room, _, name = old.removeprefix("torchpose.").partition(".")
+    if room == "protocols" and name and f"protocols.{name}" not in MODULES:
+        return not (_PACKAGE / "evaluation" / f"_{name}.py").is_file()
+    return f"{room}.{name}" in _LABORATORY
 
 
 def moved_names(package: str) -> Callable[[str], Any]:
@@ -512,7 +410,7 @@ class _OldNames:
     ) -> ModuleSpec | None:
         if not fullname.startswith("torchpose."):
             return None
-        if fullname.removeprefix("torchpose.") in LABORATORY:
+        if _is_of_laboratory(fullname):
             raise ModuleNotFoundError(
                 f"{fullname} is no part of the package any more; it belongs to the benchmarks of a "
                 "checkout of torchpose, python -m benchmarks.NAME (docs/benchmarks.md)",
