@@ -8,7 +8,6 @@ import select
 import sys
 import threading
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Any, Self
 
 from torchpose._core.checks import check_rgb
@@ -113,12 +112,7 @@ class LiveView:
         self._keys.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._keys.close()
         with self._news:
             self._closed = True

@@ -2,7 +2,6 @@
 
 import abc
 from collections.abc import Iterator
-from types import TracebackType
 from typing import NamedTuple, Self
 
 from torchpose._core.images import Image
@@ -92,10 +91,5 @@ class VideoSource(abc.ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

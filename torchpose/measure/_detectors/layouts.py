@@ -96,10 +96,16 @@ def _movenet(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     shape = outputs.shapes[0]
     if len(shape) == 4 and shape[:2] == (1, 1) and shape[3] == 3:
         joints = joint_set(shape[2], outputs.model)
-        return Layout("MoveNet single pose", joints, True, _plain, _read_movenet_single)
+        return Layout(
+            "MoveNet single pose", joints, True, np.asarray,
+            lambda out, size: decode_movenet_single(out[0], size),
+        )  # fmt: skip
     if len(shape) == 3 and (shape[2] - 5) % 3 == 0 and shape[2] > 5:
         joints = joint_set((shape[2] - 5) // 3, outputs.model)
-        return Layout("MoveNet multi pose", joints, False, _plain, _read_movenet_multi)
+        return Layout(
+            "MoveNet multi pose", joints, False, np.asarray,
+            lambda out, size: decode_movenet_multi(out[0], size),
+        )  # fmt: skip
     return None
 
 
@@ -113,8 +119,11 @@ def _simcc(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     if swapped and bins[1] * height != bins[0] * width:
         return None
     joints = joint_set(shapes[0][1], outputs.model)
-    read = _read_simcc_swapped if swapped else _read_simcc
-    return Layout("RTMPose (SimCC)", joints, True, _imagenet, read)
+    order = -1 if swapped else 1
+    return Layout(
+        "RTMPose (SimCC)", joints, True, _imagenet,
+        lambda out, size: decode_simcc(*out[::order], size),
+    )  # fmt: skip
 
 
 def _rtmo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
@@ -126,8 +135,13 @@ def _rtmo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     if dets[2] != 5 or keypoints[3] != 3:
         return None
     joints = joint_set(keypoints[2], outputs.model)
-    read = _read_rtmo_swapped if swapped else _read_rtmo
-    return Layout("RTMO", joints, False, _bgr, read, _GREY, centred=False)
+    order = -1 if swapped else 1
+    return Layout(
+        "RTMO", joints, False,
+        lambda image: image[..., ::-1].astype(np.float32),  # BGR
+        lambda out, _: decode_rtmo(*out[::order]),
+        _GREY, centred=False,
+    )  # fmt: skip
 
 
 def _heatmaps(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
@@ -139,7 +153,9 @@ def _heatmaps(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     if shape[3] * height != shape[2] * width:
         return None
     joints = joint_set(shape[1], outputs.model)
-    return Layout("heatmaps", joints, True, _imagenet, _read_heatmaps)
+    return Layout(
+        "heatmaps", joints, True, _imagenet, lambda out, size: decode_heatmaps(out[0], size)
+    )
 
 
 def _yolo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
@@ -148,73 +164,23 @@ def _yolo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
         return None
     first, last = outputs.shapes[0][1:]
     fitting = [
-        (side - before, read)
-        for side, before, read in (
-            (first, 5, _read_yolo_columns), (last, 5, _read_yolo), (last, 6, _read_yolo_suppressed),
+        (side - before, decode)
+        for side, before, decode in (
+            (first, 5, lambda out, _: decode_yolo(out[0][0].T)),
+            (last, 5, lambda out, _: decode_yolo(out[0][0])),
+            (last, 6, lambda out, _: decode_yolo_suppressed(out[0][0])),
         )
         if side > before and (side - before) % 3 == 0
     ]  # fmt: skip
     if not fitting:
         return None
-    known = [(values, read) for values, read in fitting if values // 3 in KNOWN]
-    values, read = known[0] if known else min(fitting, key=lambda one: one[0])
+    known = [(values, decode) for values, decode in fitting if values // 3 in KNOWN]
+    values, decode = known[0] if known else min(fitting, key=lambda one: one[0])
     joints = joint_set(values // 3, outputs.model)
-    return Layout("YOLO-pose", joints, False, _unit, read, _GREY)
-
-
-def _read_simcc(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_simcc(out[0], out[1], size)
-
-
-def _read_simcc_swapped(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_simcc(out[1], out[0], size)
-
-
-def _read_heatmaps(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_heatmaps(out[0], size)
-
-
-def _read_rtmo(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_rtmo(out[0], out[1])
-
-
-def _read_rtmo_swapped(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_rtmo(out[1], out[0])
-
-
-def _read_yolo(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_yolo(out[0][0])
-
-
-def _read_yolo_columns(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_yolo(out[0][0].T)
-
-
-def _read_yolo_suppressed(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_yolo_suppressed(out[0][0])
-
-
-def _read_movenet_single(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_movenet_single(out[0], size)
-
-
-def _read_movenet_multi(out: Sequence[Tensor], size: Size) -> Detections:
-    return decode_movenet_multi(out[0], size)
-
-
-def _plain(image: Image) -> np.ndarray:
-    """Return RGB in 0 to 255."""
-    return np.asarray(image)
-
-
-def _unit(image: Image) -> np.ndarray:
-    """Return RGB in 0 to 1."""
-    return image.astype(np.float32) / np.float32(255)
-
-
-def _bgr(image: Image) -> np.ndarray:
-    """Return BGR in 0 to 255."""
-    return image[..., ::-1].astype(np.float32)
+    share = np.float32(255)
+    return Layout(
+        "YOLO-pose", joints, False, lambda image: image.astype(np.float32) / share, decode, _GREY
+    )
 
 
 def _imagenet(image: Image) -> np.ndarray:
