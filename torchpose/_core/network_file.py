@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Self
 
 from torch import nn
 
@@ -12,42 +11,48 @@ from torchpose._core.module_state import outside_inference
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 
-__all__ = ["read_network", "write_network"]
-
-Network = TypeVar("Network", bound=nn.Module)
+__all__ = ["FittedNetwork"]
 
 
-def write_network(path: str | Path, kind: FileKind[Any], info: Any, network: nn.Module) -> None:
-    """Write a network as safetensors, in half precision; the file appears whole or not at all.
-
-    Numbers such as how many batches a layer has seen are left out.
+class FittedNetwork(nn.Module):
+    """Adds `save` and `load` to a network that is made from facts about its fit alone.
 
     Args:
-        path: the file. kind: of the file. info: of `kind.info`. network: whose tensors are written.
-
-    Raises:
-        OutputError: the file cannot be written.
+        info: facts about the fit, of `_kind.info`.
     """
-    state = network.state_dict().items()
-    tensors = {name: value.detach().cpu().half() for name, value in state if value.ndim}
-    write_tensors(path, kind, info, tensors)
 
+    _kind: ClassVar[FileKind[Any]]
+    _words: ClassVar[str]  # what a file holds
 
-def read_network(
-    path: str | Path, kind: FileKind[Any], make: Callable[[Any], Network], words: str
-) -> Network:
-    """Read a network that `write_network` wrote, in single precision, for evaluation.
+    def __init__(self, info: Any = None) -> None:
+        super().__init__()
+        self.info = info or self._kind.info()
 
-    Args:
-        path: the file. kind: of the file. make: makes the network from its facts. words: what it is.
+    def save(self, path: str | Path) -> None:
+        """Write the network as safetensors, in half precision; the file appears whole or not at all.
 
-    Raises:
-        InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
-    """
-    info, tensors = read_tensors(path, kind)
-    with reading(path, words), outside_inference():
-        network = make(info)
-        numbers = {name: value for name, value in network.state_dict().items() if not value.ndim}
-        given = {name: value.float() for name, value in tensors.items()}
-        network.load_state_dict(given | numbers)
-    return network.eval().requires_grad_(False)
+        Numbers such as how many batches a layer has seen are left out.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        state = self.state_dict().items()
+        tensors = {name: value.detach().cpu().half() for name, value in state if value.ndim}
+        write_tensors(path, self._kind, self.info, tensors)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a network that `save` wrote, in single precision, for evaluation.
+
+        Raises:
+            InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
+        """
+        info, tensors = read_tensors(path, cls._kind)
+        with reading(path, cls._words), outside_inference():
+            network = cls(info)
+            numbers = {
+                name: value for name, value in network.state_dict().items() if not value.ndim
+            }
+            given = {name: value.float() for name, value in tensors.items()}
+            network.load_state_dict(given | numbers)
+        return network.eval().requires_grad_(False)

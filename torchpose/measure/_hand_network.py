@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
 from torchpose._core.module_state import outside_inference
-from torchpose._core.network_file import read_network, write_network
+from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
 from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
 from torchpose.measure._hand_layers import Layer, UpwardLayer, for_inference
@@ -29,11 +29,8 @@ _FACE = (0.35, 0.4)  # half the width and height, in B, of the part of a face th
 _SPREAD = (40.0, 12.0, 12.0)  # of L, a and b, by which differences from the face are divided
 _MOST = 4.0
 _FAR = 0.3  # by which places, in B from the face, are multiplied
-_MAPS, _COLOURS, _PLACES = (
-    4,
-    3,
-    3,
-)  # inputs: skin, two kinds of motion, image; Lab; x, y, near the face
+_MAPS, _COLOURS = 4, 3  # inputs: skin, two kinds of motion, image; Lab
+_PLACES = 3  # inputs: x, y, near the face
 _WIDTHS = (12, 20, 8, 24, 40, 56)
 
 
@@ -75,7 +72,7 @@ class HandPlaces(NamedTuple):
     elbows_gone: Float[Tensor, "N E"]
 
 
-class HandNetwork(nn.Module):
+class HandNetwork(FittedNetwork):
     """Computes the probability of each hand in every cell of a window, and that it is not to be seen.
 
         q(x or gone | window) = softmax(logits),   x over 44 x 48 cells of 0.2 B
@@ -89,10 +86,11 @@ class HandNetwork(nn.Module):
         info: facts about the fit.
     """
 
+    _kind, _words = _KIND, "a network of hands"
+
     def __init__(self, info: HandNetworkInfo | None = None) -> None:
-        super().__init__()
+        super().__init__(info)
         stem, fine, side, high, middle, low = _WIDTHS
-        self.info = info or HandNetworkInfo()
         self.colours = nn.Sequential(Layer(_COLOURS, stem, 5, 2), Layer(stem, fine, 3, 2))
         self.maps = Layer(_MAPS, side)
         self.high = nn.Sequential(Layer(fine + side + _PLACES, high), Layer(high, high))
@@ -217,23 +215,6 @@ class HandNetwork(nn.Module):
         fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False)
         gone = gone - total[..., 0]
         return HandPlaces(fine[:, :2], gone[:, :2], fine[:, 2:], gone[:, 2:])
-
-    def save(self, path: str | Path) -> None:
-        """Write the network as safetensors, in half precision; the file appears whole or not at all.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        write_network(path, _KIND, self.info, self)
-
-    @classmethod
-    def load(cls, path: str | Path) -> HandNetwork:
-        """Read a network that `save` wrote, ready for use.
-
-        Raises:
-            InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
-        """
-        return read_network(path, _KIND, cls, "a network of hands")
 
 
 def _with_gone(

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.network_file import read_network, write_network
+from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
 from torchpose.body._skeleton import BODY_15
 
@@ -71,7 +71,7 @@ class Lifted(NamedTuple):
     std: Tensor
 
 
-class LiftingNetwork(nn.Module):
+class LiftingNetwork(FittedNetwork):
     """Computes the joints of a body relative to its pelvis from keypoints of one camera, frame by frame.
 
     Two layers of gated recurrent units and a linear one. A second linear layer, of the same features, tells
@@ -81,9 +81,10 @@ class LiftingNetwork(nn.Module):
         info: facts about the fit.
     """
 
+    _kind, _words = _KIND, "a network that lifts keypoints"
+
     def __init__(self, info: LiftingNetworkInfo | None = None) -> None:
-        super().__init__()
-        self.info = info or LiftingNetworkInfo()
+        super().__init__(info)
         self.cells = nn.GRU(INPUTS, _WIDTH, _LAYERS, batch_first=True)
         self.places = nn.Linear(_WIDTH, 3 * _JOINTS)
         self.spread = nn.Linear(_WIDTH, _JOINTS)
@@ -103,23 +104,6 @@ class LiftingNetwork(nn.Module):
         joints = self.places(features).unflatten(-1, (_JOINTS, 3))
         log_std = self.spread(features.detach())
         return Lifted(_UNIT * joints, _UNIT * log_std.exp()), after.transpose(0, 1)
-
-    def save(self, path: str | Path) -> None:
-        """Write the network as safetensors, in half precision; the file appears whole or not at all.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        write_network(path, _KIND, self.info, self)
-
-    @classmethod
-    def load(cls, path: str | Path) -> LiftingNetwork:
-        """Read a network that `save` wrote, ready for use.
-
-        Raises:
-            InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
-        """
-        return read_network(path, _KIND, cls, "a network that lifts keypoints")
 
 
 def lifting_features(
