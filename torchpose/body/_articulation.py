@@ -48,6 +48,8 @@ _CENTRES = {
     "right_shank": (0.0, -1.0, -0.8),
 }
 
+_HEIGHT = 1.75  # metres, of the standard body whose lengths the scales are relative to
+
 
 class BodyPoint(NamedTuple):
     """Holds points on the manifold of body states.
@@ -76,13 +78,7 @@ class JointJacobian(NamedTuple):
 
 
 class Articulation(nn.Module):
-    """Computes joints and their derivatives for bodies of a skeleton, whose lengths are part of the state.
-
-    Args:
-        height: metres, of the standard body whose lengths the scales are relative to.
-        skeleton: of the body.
-        dtype: of buffers.
-    """
+    """Computes joints and their derivatives for bodies of `BODY_15`, whose lengths are part of the state."""
 
     offsets: Tensor
     path: Tensor
@@ -97,15 +93,10 @@ class Articulation(nn.Module):
     carriers: Tensor
     in_group: Tensor
 
-    def __init__(
-        self,
-        height: float = 1.75,
-        skeleton: BodySkeleton = BODY_15,
-        dtype: torch.dtype = torch.float64,
-    ) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.skeleton = skeleton
-        standard = Body.of_height(skeleton, height)
+        self.skeleton = skeleton = BODY_15
+        standard = Body.of_height(skeleton, _HEIGHT)
         names = [name.removeprefix("left_").removeprefix("right_") for name in skeleton.names]
         groups = list(dict.fromkeys(names[1:]))
         self.groups = tuple(groups)
@@ -135,10 +126,10 @@ class Articulation(nn.Module):
         plan = {**level_plan(skeleton), **self._limb_plan()}
         buffers |= {name: torch.tensor(index, dtype=torch.long) for name, index in plan.items()}
         for name, value in buffers.items():
-            value = value.to(dtype) if value.is_floating_point() else value
+            value = value.double() if value.is_floating_point() else value
             self.register_buffer(name, value, persistent=False)
-        self.register_buffer("carriers", self._carriers().to(dtype), persistent=False)
-        in_group = torch.nn.functional.one_hot(self.group, len(groups)).to(dtype)
+        self.register_buffer("carriers", self._carriers().double(), persistent=False)
+        in_group = torch.nn.functional.one_hot(self.group, len(groups)).double()
         in_group[0] = 0
         self.register_buffer("in_group", in_group, persistent=False)
 

@@ -28,6 +28,8 @@ _HIP, _LEFT, _RIGHT = 0, 1, 2
 _BASES = {"head": None, "hand_left": "wrist_left", "hand_right": "wrist_right"}
 _RIDGE = 1e-6
 _LEAST_FRAMES = 100
+_FACING = 0.6  # cosine of the largest angle between the shoulders' line and the image
+_SHORTEST = 30  # frames of a part that faces the camera
 _AS_WRIST = tuple(name.replace("hand", "wrist").replace("neck", "shoulder_center")
                   for name in UPPER_BODY)  # fmt: skip
 _AS_HAND = tuple(name.replace("neck", "shoulder_center") for name in UPPER_BODY)
@@ -148,16 +150,11 @@ def with_wrists(recording: Recording) -> Recording:
     return _eight(recording, joints, hands=False)
 
 
-def facing_pieces(recording: Recording, least: float = 0.6, frames: int = 30) -> list[Recording]:
-    """Return the parts of a recording in which the person faces the camera, as recordings of their own.
-
-    Args:
-        least: cosine of the largest angle between the shoulders' line and the image.
-        frames: the shortest part.
-    """
+def facing_pieces(recording: Recording) -> list[Recording]:
+    """Return the parts of a recording in which the person faces the camera, as recordings of their own."""
     shoulders = _joints(recording, ("shoulder_left", "shoulder_right")).double()
     line = shoulders[:, 0] - shoulders[:, 1]
-    facing = line[:, 0] > least * line.norm(dim=-1)
+    facing = line[:, 0] > _FACING * line.norm(dim=-1)
     closed = torch.cat([facing.new_zeros(1), facing, facing.new_zeros(1)]).int()
     edges = torch.nonzero(closed.diff()).flatten().tolist()
     return [
@@ -167,7 +164,7 @@ def facing_pieces(recording: Recording, least: float = 0.6, frames: int = 30) ->
             weights=None if recording.weights is None else recording.weights[start:stop],
         )
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
-        if stop - start >= frames
+        if stop - start >= _SHORTEST
     ]
 
 

@@ -92,9 +92,9 @@ def add_pose_classes(
     return table
 
 
-def class_error(scored: Scored, name: str, smoothed: bool = False) -> float:
-    """Return the mean error of hands and elbows (cm) of arms that do this."""
-    errors = scored.smoothed if smoothed else scored.filtered
+def class_error(scored: Scored, name: str) -> float:
+    """Return the mean filtered error of hands and elbows (cm) of arms that do this."""
+    errors = scored.filtered
     chosen = scored.classes == POSE_CLASSES.index(name)
     arm = (errors[:, list(_HANDS)] + errors[:, list(_ELBOWS)]) / 2
     return 100 * float(arm[chosen].double().nanmean())

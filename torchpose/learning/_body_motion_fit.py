@@ -19,7 +19,7 @@ from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import other_side
 from torchpose.errors import InputError
 from torchpose.math._rotations import quaternion_vector_to_matrix
-from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
+from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 __all__ = [
@@ -158,14 +158,11 @@ def motion_sequence(
 def fit_body_motion(
     sequences: Sequence[MotionSequence],
     recipe: BodyMotionRecipe | None = None,
-    info: BodyMotionInfo | None = None,
-    articulation: Articulation | None = None,
 ) -> BodyMotion:
     """Fit how bodies move, their poses and proportions to recorded motion.
 
     Args:
-        sequences: of all recordings. recipe: settings. info: facts about the fit.
-        articulation: whose motion it is.
+        sequences: of all recordings. recipe: settings.
 
     Returns:
         `BodyMotion` in float64.
@@ -173,7 +170,7 @@ def fit_body_motion(
     Raises:
         InputError: too few frames in a row, or a joint that no set has.
     """
-    recipe, articulation = recipe or BodyMotionRecipe(), articulation or Articulation()
+    recipe, articulation = recipe or BodyMotionRecipe(), Articulation()
     sets = _by_origin(_long_enough(sequences))
     _check_joints(articulation, sets)
     acceleration, decay = _fit_velocities(articulation, sets)
@@ -188,8 +185,7 @@ def fit_body_motion(
         scale_mean,
         scale_cov,
         _fit_poses(articulation, sets, recipe),
-        info,
-        articulation,
+        articulation=articulation,
     )
 
 

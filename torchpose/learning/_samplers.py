@@ -82,9 +82,9 @@ class SampleSource(Protocol):
         ...
 
 
-def all_samples(source: SampleSource, epoch: int = 0) -> Samples:
+def all_samples(source: SampleSource) -> Samples:
     """Return every state of a source."""
-    return join_samples([source.block(index, epoch) for index in range(source.n_blocks)])
+    return join_samples([source.block(index) for index in range(source.n_blocks)])
 
 
 def derived_seed(seed: int, purpose: str) -> int:

@@ -42,7 +42,6 @@ def start_mixture(
     floor: Float[Tensor, " D"],
     sample_weight: Float[Tensor, " N"] | None = None,
     init: str = "k-means++",
-    lloyd_steps: int = 10,
 ) -> MixtureParameters:
     """Return a mixture to start EM from.
 
@@ -56,7 +55,6 @@ def start_mixture(
         floor: variances added to the diagonal.
         sample_weight: w_n of the points.
         init: "k-means++", or "random" for centres at points drawn at random.
-        lloyd_steps: of Lloyd's algorithm after k-means++.
 
     Returns:
         Weights, means and covariances.
@@ -69,7 +67,7 @@ def start_mixture(
         centres = standard[_draw(shares, n_components, generator)]
         labels = _nearest(standard, centres)
     else:
-        centres, labels = k_means(standard, n_components, generator, shares, lloyd_steps)
+        centres, labels = k_means(standard, n_components, generator, shares)
     counts = torch.zeros_like(centres[:, 0]).index_add_(0, labels, shares)
     # one part in ten is shared out evenly, so that a centre without points has a weight too
     weights = 0.9 * counts + 0.1 / n_components

@@ -96,22 +96,20 @@ def follow_faces(
     return torch.where(moved[:, None], placed, anchors), moved
 
 
-def cut_windows(
-    image: Image, anchors: Float[Tensor, "N 3"], replicate: bool = True
-) -> list[NDArray[np.uint8]]:
+def cut_windows(image: Image, anchors: Float[Tensor, "N 3"]) -> list[NDArray[np.uint8]]:
     """Return the image in each window, [352, 384] (or with channels), four pixels for a cell.
 
     OpenCV cuts and resizes, one person at a time: parts of an image of different sizes are no tensor.
-    The image is averaged over whole blocks of pixels, then resized by bilinear interpolation.
+    The image is averaged over whole blocks of pixels, then resized by bilinear interpolation. Its border is
+    repeated beyond it.
 
     Args:
         image: [H, W] or [H, W, C]. anchors: from `place_windows`.
-        replicate: repeat the border of the image beyond it; else zeros.
     """
     import cv2
 
     rows, columns = CELLS
-    border = cv2.BORDER_REPLICATE if replicate else cv2.BORDER_CONSTANT
+    border = cv2.BORDER_REPLICATE
     steps = _pixels_to_one(anchors[:, 2]).int().tolist()
     cut: list[NDArray[np.uint8]] = []
     for (x, y, size), step in zip(anchors.tolist(), steps, strict=True):

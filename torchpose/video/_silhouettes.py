@@ -102,15 +102,14 @@ def fit_views(
     ]
 
 
-def clean_silhouette(mask: NDArray[np.bool_], largest_hole: float = _HOLE) -> NDArray[np.bool_]:
+def clean_silhouette(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a foreground mask of one person without specks and small holes.
 
     A median filter removes single pixels, and a closing joins pieces that are a pixel apart. Pieces of
-    less than 3 % of the largest one are removed. Holes of less than `largest_hole` of the silhouette are
-    filled.
+    less than 3 % of the largest one are removed. Small holes are filled.
 
     Args:
-        mask: True on the foreground [H, W]. largest_hole: share of the silhouette.
+        mask: True on the foreground [H, W].
     """
     import cv2
 
@@ -119,7 +118,7 @@ def clean_silhouette(mask: NDArray[np.bool_], largest_hole: float = _HOLE) -> ND
     kept = _pieces(np.asarray(closed, np.uint8), _PART)
     area = int(kept.sum())
     holes = _areas(1 - kept)
-    fill = np.flatnonzero(holes.areas < largest_hole * area)
+    fill = np.flatnonzero(holes.areas < _HOLE * area)
     return np.asarray((kept > 0) | np.isin(holes.labels, fill[fill > 0]))
 
 

@@ -91,11 +91,10 @@ def find_jumps(
     joints: Float[Tensor, "T J 3"],
     fps: float,
     speeds: tuple[float, ...] = JUMP_SPEEDS,
-    spike_speed: float = SPIKE_SPEED,
 ) -> Bool[Tensor, "T J"]:
     """Find frames in which a joint is elsewhere than in the frames just before and after.
 
-    1. Spikes: up to 0.1 s between two steps that are both faster than `spike_speed` (and longer than
+    1. Spikes: up to 0.1 s between two steps that are both faster than `SPIKE_SPEED` (and longer than
        10 cm) and that lead back to within half of the shorter one. No arm turns round so quickly.
     2. Jumps: a step between measured frames s < t with |x_t - x_s| > v (t - s) / fps. Between two
        of them, up to 1/6 s that lies farther than v / (2 fps) from the median of its surroundings
@@ -107,7 +106,6 @@ def find_jumps(
         joints: metres; NaN where missing.
         fps: frames per second.
         speeds: v of each joint, m/s.
-        spike_speed: m/s.
 
     Returns:
         True for joints to leave out.
@@ -116,12 +114,10 @@ def find_jumps(
         InputError: a speed or rate that is not positive. ShapeError: another number of speeds.
     """
     check_shape("joints", joints, [None, len(speeds), 3])
-    if not (fps > 0 and min(*speeds, spike_speed) > 0):
-        raise InputError(
-            f"fps and speeds must be positive, got {fps} and {min(*speeds, spike_speed)}"
-        )
+    if not (fps > 0 and min(speeds) > 0):
+        raise InputError(f"fps and speeds must be positive, got {fps} and {min(speeds)}")
     wrong = _spikes(
-        joints, max(spike_speed / fps, _SHORTEST_SPIKE), max(1, round(_SPIKE_TIME * fps))
+        joints, max(SPIKE_SPEED / fps, _SHORTEST_SPIKE), max(1, round(_SPIKE_TIME * fps))
     )
     joints = torch.where(wrong[..., None], torch.nan, joints)
     reach = joints.new_tensor(speeds) / fps

@@ -74,16 +74,14 @@ def find_duplicates(recordings: Sequence[Recording], shared: float = _SHARED) ->
     ]
 
 
-def refuse_shared_recordings(
-    train: Sequence[Recording], test: Sequence[Recording], shared: float = _SHARED
-) -> None:
+def refuse_shared_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> None:
     """Raise if a recording, or part of it, is on both sides.
 
     Raises:
         OverlapError: both files and persons are named.
     """
     both = [*train, *test]
-    for found in find_duplicates(both, shared):
+    for found in find_duplicates(both):
         if found.first < len(train) <= found.second:
             raise OverlapError(
                 f"{describe_duplicate(found, both)}; the first would be in the test and the second "
@@ -91,9 +89,7 @@ def refuse_shared_recordings(
             )
 
 
-def refuse_shared_between_persons(
-    recordings: Sequence[Recording], shared: float = _SHARED
-) -> list[Duplicate]:
+def refuse_shared_between_persons(recordings: Sequence[Recording]) -> list[Duplicate]:
     """Raise if a recording, or part of it, is there under two persons.
 
     Returns:
@@ -102,7 +98,7 @@ def refuse_shared_between_persons(
     Raises:
         OverlapError: both files and persons are named.
     """
-    duplicates = find_duplicates(recordings, shared)
+    duplicates = find_duplicates(recordings)
     for found in duplicates:
         if recordings[found.first].person_id != recordings[found.second].person_id:
             raise OverlapError(

@@ -119,10 +119,10 @@ def _simcc(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     if swapped and bins[1] * height != bins[0] * width:
         return None
     joints = joint_set(shapes[0][1], outputs.model)
-    order = -1 if swapped else 1
+    x, y = (1, 0) if swapped else (0, 1)
     return Layout(
         "RTMPose (SimCC)", joints, True, _imagenet,
-        lambda out, size: decode_simcc(*out[::order], size),
+        lambda out, size: decode_simcc(out[x], out[y], size),
     )  # fmt: skip
 
 

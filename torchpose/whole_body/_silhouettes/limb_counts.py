@@ -51,7 +51,6 @@ def count_parts(
     silhouettes: Tensor | PreparedSilhouettes,
     *,
     chunk: int | None = None,
-    near: float = NEAR,
 ) -> PartCounts:
     """Return each position's weight: the sum of a silhouette that is 1/2 under the opposing part.
 
@@ -70,7 +69,6 @@ def count_parts(
         cameras: C of them, with images of the silhouettes' size.
         silhouettes: as for `count_pixels`; their leading dimensions are the first of the batch.
         chunk: batch items at a time; chosen by the size of the images if None (some 10 MB).
-        near: metres.
 
     Returns:
         `PartCounts`, each [*batch, S, C].
@@ -80,7 +78,7 @@ def count_parts(
 
     Reference: Daubney & Xie, section 5 and equation (4).
     """
-    rig, parts = as_rig(cameras), _positions("parts", parts, near)
+    rig, parts = as_rig(cameras), _positions("parts", parts)
     if not isinstance(silhouettes, PreparedSilhouettes):
         silhouettes = prepare_silhouettes(silhouettes)
     rig.check_images("silhouettes", silhouettes.shape)
@@ -89,7 +87,7 @@ def count_parts(
     which = which_silhouette(n, _shared(silhouettes, batch), silhouettes.before)
     before = silhouettes.before.to(parts.start.device)
     mine = flatten_limbs(parts)
-    theirs = None if opposing is None else _union(opposing, batch, near)
+    theirs = None if opposing is None else _union(opposing, batch)
     counts = torch.zeros(3, n, n_positions, strip.cameras, device=parts.start.device)
     counts = counts.to(torch.int64)
 
@@ -97,12 +95,12 @@ def count_parts(
         begin = None if which is None else which[items]
         each = None if begin is None else begin.repeat_interleave(n_positions)
         some = slice(items.start * n_positions, items.stop * n_positions)
-        rows = intervals_of(mine, some, rig, strip, near, "cylinders")
+        rows = intervals_of(mine, some, rig, strip, NEAR, "cylinders")
         counts[:2, items] = count_intervals(rows, before.view(-1), each, strip).unflatten(
             1, (-1, n_positions)
         )
         if theirs is not None:
-            other = intervals_of(theirs, items, rig, strip, near, "cylinders")
+            other = intervals_of(theirs, items, rig, strip, NEAR, "cylinders")
             union = _Union.of(other, before, begin, strip)
             shared = _shared_pixels(rows, union, n_positions, strip)
             counts[2, items] = shared.unflatten(0, (-1, n_positions))
@@ -179,16 +177,16 @@ def _shared_pixels(
     return total.diff().view(rows.per_image.shape)
 
 
-def _positions(name: str, parts: Limbs, near: float) -> Limbs:
+def _positions(name: str, parts: Limbs) -> Limbs:
     """Return limbs [*batch, S, K] of which each position is one item."""
     if parts.start.ndim < 4:
         raise ShapeError(f"{name} must have shape [..., S, K, 3], got {list(parts.start.shape)}")
-    return checked_limbs(parts, near)
+    return checked_limbs(parts, NEAR)
 
 
-def _union(opposing: Limbs, batch: tuple[int, ...], near: float) -> Limbs:
+def _union(opposing: Limbs, batch: tuple[int, ...]) -> Limbs:
     """Return all positions of the opposing part as limbs of one item."""
-    opposing = _positions("opposing parts", opposing, near)
+    opposing = _positions("opposing parts", opposing)
     if tuple(opposing.start.shape[:-3]) != batch:
         raise ShapeError(
             f"the opposing part must have the leading dimensions {list(batch)} of the part, got "
