@@ -11,13 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.demo._mannequin import ANGLE_LIMITS, BodyAngles, BodySize, hands_to_arms
+from torchpose._core.checks import check_finite, check_shape
+from torchpose.demo._mannequin import ANGLE_LIMITS, BodyAngles, BodySize, raised_shoulder
 from torchpose.demo._performer import Performance, hip_sway, minimum_jerk, performer, stage, sway
 from torchpose.errors import InputError
+from torchpose.math._rotations import rotvec_to_matrix
 
-__all__ = ["PERFORMANCES", "crossing", "performance"]
+__all__ = ["PERFORMANCES", "crossing", "hands_to_arms", "performance"]
 
 PERFORMANCES = (
     "performer", "signing", "clapping", "merging hands", "crossed arms", "raised arms"
@@ -31,6 +34,8 @@ _REST: Place = (0.20, 0.66, -0.10)
 _LABEL_REST = "rest"
 _HANGING = (7.0, 4.0, -20.0, 17.0)  # abduction, flexion, twist and elbow of an arm, degrees
 _HEIGHTS = {"above": (110, 160), "beside": (60, 110), "across": (40, 100)}  # of raised arms
+
+_ELBOW_SIDE = (0.40, 0.80, 0.35)  # where the elbow goes, seen from the line to the hand: out, down
 
 
 class _Keys(NamedTuple):
@@ -156,6 +161,52 @@ def _animate(
     hands = hands + sway(clock, (2, 3), 0.004, (0.15, 0.8), generator)
     angles = _swaying(clock, hands_to_arms(hands, size), generator)
     return angles, _words(clock, times, keys.labels)
+
+
+def hands_to_arms(
+    hands: Float[Tensor, "T 2 3"], size: BodySize | None = None
+) -> Float[Tensor, "T 2 4"]:
+    """Return the angles of the arms that bring the hands to given places (inverse kinematics).
+
+    Upper arm and forearm form a triangle over the line from shoulder to hand; the elbow is on its
+    lower, outer side. The shoulder rises with the upper arm, so it is found by iteration.
+
+    Args:
+        hands: of the left and the right hand, from the neck, in the torso's axes, metres. Places out
+            of reach are replaced by the nearest on the line to them.
+        size: bone lengths.
+
+    Returns:
+        Abduction, flexion, twist, elbow, radians; only the elbow is certain to be within `ANGLE_LIMITS`.
+    """
+    size = size or BodySize()
+    check_shape("hands", hands, [None, 2, 3])
+    check_finite("hands", hands)
+    mirror = hands.new_tensor([[1.0, 1, 1], [-1.0, 1, 1]])
+    hands = hands * mirror
+    a, b = size.upper_arm, size.forearm + size.hand
+    bent = torch.deg2rad(hands.new_tensor(ANGLE_LIMITS["elbow"]))
+    far, near = (a * a + b * b + 2 * a * b * torch.cos(bent)).sqrt().tolist()
+    raised = torch.zeros_like(hands[..., 0])
+    for _ in range(12):
+        to_hand = hands - raised_shoulder(raised, size)
+        reach = to_hand.norm(dim=-1, keepdim=True)
+        to_hand = to_hand / reach
+        reach = reach.clamp(near, far)
+        outer = hands.new_tensor(_ELBOW_SIDE) - to_hand * (
+            to_hand @ hands.new_tensor(_ELBOW_SIDE)
+        ).unsqueeze(-1)
+        outer = outer / outer.norm(dim=-1, keepdim=True)
+        cosine = (a * a + reach * reach - b * b) / (2 * a * reach)
+        upper = cosine * to_hand + (1 - cosine * cosine).clamp_min(0).sqrt() * outer
+        raised = torch.acos(upper[..., 1].clamp(-1, 1))
+    per_sine = raised / torch.sin(raised).clamp_min(1e-9)
+    abduction, flexion = per_sine * upper[..., 0], -per_sine * upper[..., 2]
+    swing = rotvec_to_matrix(torch.stack([-flexion, torch.zeros_like(flexion), -abduction], -1))
+    fore = (swing.mT @ (reach * to_hand - a * upper).unsqueeze(-1)).squeeze(-1)
+    twist = torch.atan2(fore[..., 0], -fore[..., 2])
+    straight = (reach[..., 0].square() - a * a - b * b) / (2 * a * b)
+    return torch.stack([abduction, flexion, twist, torch.acos(straight.clamp(-1, 1))], -1)
 
 
 def _swaying(clock: Tensor, arms: Tensor, generator: torch.Generator) -> BodyAngles:

@@ -56,11 +56,11 @@ def test_limbs_without_twist_have_the_same_joints(articulation):
         g = torch.Generator().manual_seed(2)
         step = 0.3 * torch.randn(4, articulation.dim, generator=g, dtype=torch.float64)
         point = articulation.moved(point, step)
-    free = articulation.untwisted(point)
+    free = articulation.swung(point, articulation.joints(point))
     torch.testing.assert_close(articulation.joints(free), articulation.joints(point))
     twist = (free.rotations - free.rotations.mT)[:, list(articulation.limb_parts), 0, 2]
     torch.testing.assert_close(twist, torch.zeros_like(twist))
-    again = articulation.untwisted(free)
+    again = articulation.swung(free, articulation.joints(free))
     torch.testing.assert_close(again.rotations, free.rotations)
 
 

@@ -218,10 +218,6 @@ class Articulation(nn.Module):
             -1,
         )
 
-    def untwisted(self, point: BodyPoint) -> BodyPoint:
-        """Return the same joints with limbs that have no twist about their centres."""
-        return self.swung(point, self.joints(point))
-
     def swung(
         self,
         point: BodyPoint,

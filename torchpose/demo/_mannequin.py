@@ -19,11 +19,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
 from torchpose.math._rotations import euler_to_matrix, rotvec_to_matrix
 
-__all__ = ["ANGLE_LIMITS", "BodyAngles", "BodySize", "angles_to_joints", "hands_to_arms"]
+__all__ = ["ANGLE_LIMITS", "BodyAngles", "BodySize", "angles_to_joints", "raised_shoulder"]
 
 ANGLE_LIMITS = {
     "abduction": (-60.0, 165.0),
@@ -32,8 +32,6 @@ ANGLE_LIMITS = {
     "elbow": (3.0, 145.0),
 }
 """Range of the arm's angles in degrees, in the order of `BodyAngles.arms`."""
-
-_ELBOW_SIDE = (0.40, 0.80, 0.35)  # where the elbow goes, seen from the line to the hand: out, down
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ def angles_to_joints(
     abduction, flexion, twist, elbow = angles.arms.unbind(-1)
     zero = torch.zeros_like(abduction)
     raised = torch.hypot(abduction, flexion)
-    shoulder = _shoulder(raised, size)
+    shoulder = raised_shoulder(raised, size)
     swing = rotvec_to_matrix(torch.stack([-flexion, zero, -abduction], -1))
     outward = rotvec_to_matrix(torch.stack([zero, -twist, zero], -1))
     fold = rotvec_to_matrix(torch.stack([-elbow, zero, zero], -1))
@@ -131,61 +129,7 @@ def angles_to_joints(
     return joints, arm[:, :, 3]
 
 
-def hands_to_arms(
-    hands: Float[Tensor, "T 2 3"], size: BodySize | None = None
-) -> Float[Tensor, "T 2 4"]:
-    """Return the angles of the arms that bring the hands to given places (inverse kinematics).
-
-    Upper arm and forearm form a triangle over the line from shoulder to hand; the elbow is on its
-    lower, outer side. The shoulder rises with the upper arm, so it is found by iteration.
-
-    Args:
-        hands: of the left and the right hand, from the neck, in the torso's axes, metres. Places out
-            of reach are replaced by the nearest on the line to them.
-        size: bone lengths.
-
-    Returns:
-        Abduction, flexion, twist, elbow, radians; only the elbow is certain to be within `ANGLE_LIMITS`.
-
-    Example:
-        >>> hands = torch.tensor([[[0.1, 0.2, -0.3], [-0.1, 0.2, -0.3]]])
-        >>> arms = hands_to_arms(hands)
-        >>> zero = torch.zeros(1, 3)
-        >>> joints, _ = angles_to_joints(BodyAngles(zero, zero, zero, arms))
-        >>> torch.allclose(joints[:, [0, 7]] - joints[:, 4:5], hands, atol=1e-4)
-        True
-    """
-    size = size or BodySize()
-    check_shape("hands", hands, [None, 2, 3])
-    check_finite("hands", hands)
-    mirror = hands.new_tensor([[1.0, 1, 1], [-1.0, 1, 1]])
-    hands = hands * mirror
-    a, b = size.upper_arm, size.forearm + size.hand
-    bent = torch.deg2rad(hands.new_tensor(ANGLE_LIMITS["elbow"]))
-    far, near = (a * a + b * b + 2 * a * b * torch.cos(bent)).sqrt().tolist()
-    raised = torch.zeros_like(hands[..., 0])
-    for _ in range(12):
-        to_hand = hands - _shoulder(raised, size)
-        reach = to_hand.norm(dim=-1, keepdim=True)
-        to_hand = to_hand / reach
-        reach = reach.clamp(near, far)
-        outer = hands.new_tensor(_ELBOW_SIDE) - to_hand * (
-            to_hand @ hands.new_tensor(_ELBOW_SIDE)
-        ).unsqueeze(-1)
-        outer = outer / outer.norm(dim=-1, keepdim=True)
-        cosine = (a * a + reach * reach - b * b) / (2 * a * reach)
-        upper = cosine * to_hand + (1 - cosine * cosine).clamp_min(0).sqrt() * outer
-        raised = torch.acos(upper[..., 1].clamp(-1, 1))
-    per_sine = raised / torch.sin(raised).clamp_min(1e-9)
-    abduction, flexion = per_sine * upper[..., 0], -per_sine * upper[..., 2]
-    swing = rotvec_to_matrix(torch.stack([-flexion, torch.zeros_like(flexion), -abduction], -1))
-    fore = (swing.mT @ (reach * to_hand - a * upper).unsqueeze(-1)).squeeze(-1)
-    twist = torch.atan2(fore[..., 0], -fore[..., 2])
-    straight = (reach[..., 0].square() - a * a - b * b) / (2 * a * b)
-    return torch.stack([abduction, flexion, twist, torch.acos(straight.clamp(-1, 1))], -1)
-
-
-def _shoulder(raised: Tensor, size: BodySize) -> Tensor:
+def raised_shoulder(raised: Tensor, size: BodySize) -> Tensor:
     """Return the left shoulder relative to the neck [..., 3] for an arm raised by an angle, radians."""
     shrug = 0.24 * torch.nn.functional.softplus(raised - math.radians(30), beta=6.0)
     zero = torch.zeros_like(shrug)

@@ -94,15 +94,11 @@ class StreamedEM(MixtureFit):
 
         Args:
             source: the states.
-            n_components: number of Gaussians K.
-            seed: an integer, or the generator to draw from.
             start_samples: number of samples to start from, spread evenly over the source; every process
                 looks at the same ones.
-            covariance_floor: added to every variance, relative to the variance of the states in that
-                dimension (relative to one unit, where they do not vary at all).
             init: "k-means++", "random" (means at states drawn at random), or the mixture to start
                 from, in units of the states.
-            dtype: the floating-point type of the products over the states; the mixture is float64.
+            n_components, seed, covariance_floor, dtype: as `GaussianMixture.fit`.
 
         Raises:
             InputError: fewer usable samples or distinct poses than components, samples that are not

@@ -141,19 +141,7 @@ class SkinModel(nn.Module):
         faces: Float[Tensor, "B 3"],
         hands: Float[Tensor, "B H W"] | None = None,
     ) -> tuple[SkinState, Float[Tensor, "B H W"]]:
-        """Learn from a frame, and return the probability of skin in it.
-
-        Args:
-            state: from `init` or the step before. lab: see `rgb_to_lab`.
-            faces: centre (x, y) and size of each image's face, pixels.
-            hands: probability that a pixel belongs to a hand, where known.
-
-        Returns:
-            The next state, and the probability of skin.
-
-        Raises:
-            ShapeError: wrong shapes. InputError: faces without a size.
-        """
+        """Learn from a frame, and return the probability of skin in it; see `SkinMixtureModel.step`."""
         check_shape("lab", lab, [len(state.face), 3, "H", "W"])
         check_faces(faces, len(state.face))
         bins = self.bins(lab)

@@ -168,7 +168,8 @@ def find_pose(
         body: a `torchpose.body.Body`.
         silhouettes: bool [C, H, W], or [B, C, H, W] for a frame of each of B persons.
         cameras: the C cameras.
-        prior: poses to start from, as `find_candidates`; None is the rest pose.
+        prior: poses to start from: relative columns [M, Q], states [M, D], a fitted
+            `BackConstrainedGPLVM`, or None for the rest pose.
         generator: one generator, or a list of one for each of B.
         n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
         n_headings: sectors of the circle. survival_rate: the survival rate of a layer, above 0 to below 1.
@@ -181,7 +182,8 @@ def find_pose(
         State [D] or [B, D].
 
     Raises:
-        InputError, ShapeError, CameraError, PriorError: as `find_candidates`.
+        InputError: no camera sees the person, or a bad setting or list. ShapeError, CameraError: silhouettes,
+        cameras or prior of other sizes. PriorError: a manifold of another skeleton.
     """
     batched = silhouettes.ndim == 4
     silhouettes = silhouettes if batched else silhouettes[None]
@@ -219,22 +221,13 @@ def find_candidates(
     gather where the likelihood is high; the mean of the best ones is the sector's pose.
 
     Args:
-        body: a `torchpose.body.Body`.
-        silhouettes: bool [B, C, H, W], a frame of each of B persons. cameras: the C cameras.
-        prior: poses to start from: relative columns [M, Q], states [M, D], a fitted
-            `BackConstrainedGPLVM`, or None for the rest pose.
-        generator: one generator, or a list of one for each of B.
-        n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
+        silhouettes: bool [B, C, H, W], a frame of each of B persons.
         n_headings: S, sectors of the circle; one of 120 degrees with `facing`.
-        survival_rate: the survival rate of a layer.
-        likelihood: "bidirectional" or "overlap"; its exponents are solved from the survival rate.
-        limits: joint limits with `clamp(states)`, or None.
-        up: [3], direction of the world's vertical; by `upward_direction` if None.
-        facing: [3], the world direction that the person faces to within 60 degrees, if it is known.
+        body, cameras, prior, generator, n_particles, n_layers, survival_rate, likelihood, limits, up,
+            facing: as `find_pose`; the exponents of the likelihood are solved from the survival rate.
 
     Raises:
-        InputError: no camera sees the person, or a bad setting or list. ShapeError, CameraError: silhouettes,
-        cameras or prior of other sizes. PriorError: a manifold of another skeleton.
+        InputError, ShapeError, CameraError, PriorError: as `find_pose`.
     """
     check_choice("likelihood", likelihood, LIKELIHOODS)
     if n_headings < 1 or n_particles < n_headings or n_layers < 2:

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from torchpose.demo._mannequin import BodyAngles, BodySize, angles_to_joints, hands_to_arms
+from benchmarks._performances import hands_to_arms
+from torchpose.demo._mannequin import BodyAngles, BodySize, angles_to_joints
 from torchpose.errors import InputError
 
 
