@@ -50,7 +50,8 @@ class Protocol(NamedTuple):
     def options(self) -> tuple[Option, ...]:
         """Return its options beside the common ones, by the signature of the function."""
         spaced = getattr(import_module(self.run.__module__), "SPACED", ())
-        return options_of(self.run, _COMMON, spaced=spaced)
+        shared = PROTOCOLS["leave-one-person-out"].run
+        return options_of(self.run, _COMMON, spaced=spaced, refers_to=shared)
 
 
 PROTOCOLS = {

@@ -125,19 +125,16 @@ def run(
             kinect_laban, mocap_cmu_walk and mocap_cmu_actions.
         out: folder for the results.
         seed: the seed of priors, noise and made-up joints. progress: whether to show bars.
+        n_components, window_components, window_samples, every, workers, fits: see
+            `torchpose.evaluation._leave_one_person_out.run`.
         quick: small priors and few sequences, to see that all of it works.
         part: the part to run: "cross", "added" (motion capture for training) or "both".
         tested: persons whom no prior of their own data set sees; by default the last quarter of a data
             set.
         added: folders of motion capture for the second part, with shoulders, elbows, wrists and hips;
             without one there is no second part.
-        n_components: the number of Gaussians per arm over poses; by default that of the recipe.
-        window_components: the number of Gaussians per arm over windows; by default that of the recipe.
-        window_samples: the number of training windows; by default that of the recipe.
         mocap_share: the largest number of frames of motion capture that are added, as a multiple of the
             others'.
-        every: track only each n-th sequence of a person. workers: the number of processes.
-        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
         recipe: fits the priors.
 
     Raises:

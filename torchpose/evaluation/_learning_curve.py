@@ -76,6 +76,8 @@ def run(
             kinect_utd_mhad that is taken, with burke_kinect and kinect_laban beside it as `more`.
         out: folder for the results.
         seed: the seed of priors and noise. progress: whether to show bars.
+        n_components, window_components, window_samples, every, workers, fits: see
+            `torchpose.evaluation._leave_one_person_out.run`.
         quick: small priors, few subsets and a tenth of the sequences, to see that all of it works.
         more: folders or files with further training persons, for counts beyond the persons of `data`
             less one.
@@ -84,11 +86,6 @@ def run(
         n_subsets: the number of fits for each count, at most one for each person.
         n_own: the number of persons for whom a prior of their own is fitted; 0 leaves that part out, and
             persons with one recording are left out of it.
-        n_components: the number of Gaussians per arm over poses; by default that of the recipe.
-        window_components: the number of Gaussians per arm over windows; by default that of the recipe.
-        window_samples: the number of training windows; by default that of the recipe.
-        every: track only each n-th sequence of a person. workers: the number of processes.
-        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
         compare: other recipes to draw beside `torchpose.learning._recipes.fit_kinect_prior`, each as
             NAME=module.function.
         recipes: names and functions, instead of all that.
