@@ -8,8 +8,6 @@ from torch import Tensor
 from torchpose._core.checks import check_floating, check_shape
 from torchpose.errors import InputError, ShapeError
 
-__all__ = ["as_pair", "as_values", "check_mask"]
-
 
 def as_values(name: str, values: Tensor, sizes: Sequence[int | str | None]) -> Tensor:
     """Return real numbers of these sizes, in single precision or double; half precision is widened.

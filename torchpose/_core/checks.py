@@ -15,26 +15,6 @@ from torchpose.errors import (
     ShapeError,
 )
 
-__all__ = [
-    "MOST_CONFIDENCE",
-    "check_choice",
-    "check_count",
-    "check_covariance",
-    "check_finite",
-    "check_floating",
-    "check_grey",
-    "check_height",
-    "check_positive",
-    "check_rate",
-    "check_real",
-    "check_rgb",
-    "check_shape",
-    "check_weights",
-    "number_of",
-    "refuse_export",
-    "refuse_unused",
-]
-
 MOST_CONFIDENCE = 2.0
 """Of a keypoint: peaks of heat maps may exceed 1, and count as 1; more is a score in percent."""
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from torch import Tensor
 
-__all__ = ["digest_of", "digest_of_files"]
-
 
 def digest_of(parts: Iterable[str | bytes | Tensor]) -> str:
     """Return SHA-256 of texts, bytes and the numbers of tensors, one after the other."""

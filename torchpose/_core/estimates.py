@@ -13,8 +13,6 @@ from torchpose._core.checks import check_rate
 from torchpose._core.reading import one_number, texts
 from torchpose.errors import FileFormatError, InputError
 
-__all__ = ["check_estimates", "check_number_range", "frame_facts", "to_tensor"]
-
 _ASYMMETRY = _BELOW_ZERO = 1e-4  # of the largest entry; poses are kept in single precision as well
 
 

@@ -5,8 +5,6 @@ from collections.abc import Callable
 
 from torchpose._core.moved import NAMES, moved_names
 
-__all__ = ["list_public", "package_version", "set_up_facade"]
-
 
 def set_up_facade(module: str) -> None:
     """Give a room its `__dir__`, and its `__getattr__` for names that have left it.

@@ -9,8 +9,6 @@ import torch
 
 from torchpose._core.moved import ARGUMENTS, warn_of_former
 
-__all__ = ["rename_former_hook", "takes_former_arguments", "variances"]
-
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 

@@ -3,7 +3,5 @@
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Image"]
-
 Image = NDArray[np.uint8]
 """Eight bits a channel: RGB [H, W, 3], or grey [H, W]."""

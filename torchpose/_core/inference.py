@@ -9,8 +9,6 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["in_inference_mode", "usable_anywhere"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

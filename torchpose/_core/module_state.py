@@ -12,17 +12,6 @@ from torch import Tensor, nn
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 
-__all__ = [
-    "WideModule",
-    "derived",
-    "in_own_precision",
-    "one_run",
-    "outside_inference",
-    "register_given",
-    "wide_or_parameter",
-    "working_precision",
-]
-
 T = TypeVar("T")
 
 

@@ -12,18 +12,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-__all__ = [
-    "ARGUMENTS",
-    "MODULES",
-    "NAMES",
-    "install",
-    "moved_from",
-    "moved_function",
-    "moved_names",
-    "present_module",
-    "warn_of_former",
-]
-
 _PACKAGE = Path(__file__).parents[1]
 _BETWEEN = {"torchpose", "torch", "importlib"}  # packages between a program and a warning
 

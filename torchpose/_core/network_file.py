@@ -11,8 +11,6 @@ from torchpose._core.module_state import outside_inference
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 
-__all__ = ["FittedNetwork"]
-
 
 class FittedNetwork(nn.Module):
     """Adds `save` and `load` to a network that is made from facts about its fit alone.

@@ -24,21 +24,6 @@ import numpy as np
 
 from torchpose.errors import FileFormatError, InputError, TorchposeError, printable
 
-__all__ = [
-    "check_arrays",
-    "check_span",
-    "npz_keys",
-    "one_number",
-    "one_text",
-    "read_json",
-    "read_npz",
-    "read_text",
-    "reading",
-    "require_file",
-    "sizes_fit",
-    "texts",
-]
-
 # What parsers raise at damaged files: those of Python, NumPy, PyTorch and safetensors. A lack of memory
 # is none of them: sizes are looked at before anything is allocated.
 _DAMAGE = (

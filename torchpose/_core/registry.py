@@ -4,8 +4,6 @@ from typing import TypeVar
 
 from torchpose.errors import InputError
 
-__all__ = ["add_method"]
-
 _Method = TypeVar("_Method")
 
 

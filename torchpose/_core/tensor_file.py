@@ -25,16 +25,6 @@ from torchpose._core.files import atomic_path
 from torchpose._core.reading import reading, require_file, sizes_fit
 from torchpose.errors import FileFormatError, OutputError, PriorError
 
-__all__ = [
-    "FileKind",
-    "format_of",
-    "info_from_json",
-    "info_to_json",
-    "read_tensors",
-    "require_tensor",
-    "write_tensors",
-]
-
 _LARGEST = 2**63  # of whole numbers in facts
 _HEADER = "torchpose"  # one key: the order of several is not reproducible in safetensors
 Info = TypeVar("Info")

@@ -5,8 +5,6 @@ import sys
 
 from torchpose.errors import printable
 
-__all__ = ["one_line", "show_progress"]
-
 _POSITIONALS = {"input": "INPUT", "recordings": "DIR"}
 
 

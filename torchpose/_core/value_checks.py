@@ -10,8 +10,6 @@ from contextvars import ContextVar
 
 import torch
 
-__all__ = ["values_visible", "without_value_checks"]
-
 _HIDDEN: ContextVar[bool] = ContextVar("torchpose_values_hidden", default=False)
 
 

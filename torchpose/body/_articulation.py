@@ -32,8 +32,6 @@ from torchpose.math._rotations import (
     quaternion_vector_to_matrix,
 )
 
-__all__ = ["Articulation", "BodyPoint", "JointJacobian"]
-
 # Where the bone of a limb points at its centre, in the axes of the part above: opposite to where no
 # bone can point, since a swing by half a turn has no single axis. x left, y up, z forward.
 _CENTRES = {

@@ -25,8 +25,6 @@ from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError, SkeletonError
 from torchpose.math._rotations import cross_matrix, minimal_rotation, quaternion_vector_to_matrix
 
-__all__ = ["fit_body", "fit_errors", "fit_state", "swing_parts"]
-
 _TILT = 0.5  # radians, standard deviation between the tilts of pelvis and torso
 _LEVER = 0.04  # metres, least distance of the pelvis joint from the hips that tells the tilt
 _TORSO_TILT = 1e-2  # square metres, weight of the torso's tilt where the hips do not tell

@@ -36,8 +36,6 @@ from torchpose.math._rotations import (
     within_unit_ball,
 )
 
-__all__ = ["FRAMES", "Body", "Frame", "centres_of"]
-
 Frame = Literal["parent", "body"]
 FRAMES: tuple[Frame, ...] = ("parent", "body")
 

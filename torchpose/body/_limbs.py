@@ -12,19 +12,6 @@ from torchpose._core.module_state import outside_inference
 from torchpose.body._skeleton import BodySkeleton
 from torchpose.errors import InputError, ShapeError
 
-__all__ = [
-    "Limbs",
-    "chained",
-    "check_limb_lengths",
-    "check_limbs",
-    "checked_directions",
-    "checked_lengths",
-    "checked_radii",
-    "checked_tips",
-    "level_plan",
-    "point_weights",
-]
-
 
 class Limbs(NamedTuple):
     """Holds the tapered cylinders with round ends of a body's L limbs.

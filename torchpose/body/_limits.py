@@ -10,8 +10,6 @@ from torchpose._core.checks import check_finite, check_shape
 from torchpose.errors import InputError, ShapeError
 from torchpose.math._rotations import within_unit_ball
 
-__all__ = ["JointLimits"]
-
 _ROOT_COLUMNS = 6  # position and orientation of the root have no limits
 _LEAST_MARGIN = 0.03  # sine of half the angle: about 3.5 degrees
 

@@ -19,8 +19,6 @@ from torchpose.errors import InputError, SkeletonError
 from torchpose.math._tree_messages import tree_levels
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = ["BODY_15", "BodySkeleton", "TaperedCylinder", "Tip", "body_joints", "other_side"]
-
 Offset = tuple[float, float, float]
 
 

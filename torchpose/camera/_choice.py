@@ -12,8 +12,6 @@ from torchpose.camera._projection import intrinsics
 from torchpose.camera._rig import scale_matrix
 from torchpose.errors import CameraError
 
-__all__ = ["fit_to_size", "is_padded", "resolve_camera"]
-
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _LEAST_FOCAL = 10.0  # pixels
 _SQUEEZED = 0.02  # of the ratio of the sides: images of another shape are cut, and not scaled

@@ -26,8 +26,6 @@ from torchpose.math._rotations import (
     rotvec_to_matrix,
 )
 
-__all__ = ["PinholeCamera", "load_cameras", "save_cameras"]
-
 _FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
 _LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none
 _LARGEST_SIDE = 100_000  # pixels of an image

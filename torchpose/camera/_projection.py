@@ -18,21 +18,6 @@ from torchpose.errors import CameraError
 from torchpose.math._rotations import RotationOrder, euler_to_matrix
 from torchpose.math._unscented import unscented_transform
 
-__all__ = [
-    "PixelMap",
-    "arm_in_body_frame",
-    "arm_in_camera_frame",
-    "backproject",
-    "check_intrinsics",
-    "intrinsics",
-    "join_arms",
-    "lift",
-    "map_pixel_covariance",
-    "map_pixels",
-    "pixel_covariances",
-    "project",
-]
-
 _SHORTEST, _LARGEST = 1e-6, 1e9  # pixels: focal lengths and entries beyond are of no camera
 
 

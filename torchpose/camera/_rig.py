@@ -14,17 +14,6 @@ from torchpose._core.checks import check_floating, check_shape
 from torchpose.camera._pinhole import PinholeCamera, load_cameras
 from torchpose.errors import CameraError, InputError
 
-__all__ = [
-    "CameraRig",
-    "Cameras",
-    "RigView",
-    "as_rig",
-    "distort_rays",
-    "scale_matrix",
-    "straighten_rays",
-    "undistortion_maps",
-]
-
 _OPENCV_DISTORTIONS = 14  # the longest list that OpenCV takes; zeros change nothing
 _UNTIL = (3, 100, 1e-12)  # steps at most, or this change, of OpenCV's search for an inverse
 _LARGEST_OFF = 1.0  # pixels, between a point and its inverse distorted again

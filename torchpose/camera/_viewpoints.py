@@ -9,8 +9,6 @@ from torch import Tensor
 
 from torchpose.errors import InputError
 
-__all__ = ["PAPER_VIEWS", "ViewRange", "Viewpoints", "sample_viewpoints"]
-
 
 class Viewpoints(NamedTuple):
     """Holds camera poses: angles (roll, pitch, yaw) [N, 3] in radians, translation [N, 3] in metres."""

@@ -18,22 +18,6 @@ from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = [
-    "BodyPath",
-    "BodyView",
-    "PathModel",
-    "Regression",
-    "body_path",
-    "from_view",
-    "log_magnification",
-    "memory_frames",
-    "path_regression",
-    "planes_in_view",
-    "to_view",
-    "view_body",
-    "view_jacobian",
-]
-
 MEMORY = 1.0
 """Seconds of the past that tell where head and neck are."""
 

@@ -18,14 +18,6 @@ if TYPE_CHECKING:
     from torchpose.measure._keypoint_measurer import FrameKeypoints, KeypointMeasurer
     from torchpose.video._source_interface import VideoSource
 
-__all__ = [
-    "BodyKeypoints",
-    "DetectorSettings",
-    "are_keypoints",
-    "common_rate",
-    "read_body_keypoints",
-]
-
 _FPS = 30.0
 _SAME_RATE = 3  # digits
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from torchpose.video._source_interface import VideoSource
     from torchpose.whole_body._body_track import BodyTrack
 
-__all__ = ["Recordings", "SilhouetteSettings", "in_silhouettes", "pixel_scale"]
-
 
 class SilhouetteSettings(NamedTuple):
     """Holds how videos become silhouettes.

@@ -14,8 +14,6 @@ from jsonargparse import ActionConfigFile, ArgumentParser
 from torchpose.cli._options import REQUIRED, Option, options_of, summary_of
 from torchpose.errors import InputError
 
-__all__ = ["Command", "Given", "add_options", "new_parser", "parse_seed"]
-
 _METAVARS = {
     "action": "NAME|FILE", "actions": "ACTION", "body": "FILE",
     "bone_lengths": "NAME=M,...", "camera": "FILE|fx,fy,cx,cy", "camera_name": "NAME",

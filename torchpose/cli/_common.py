@@ -7,8 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
-__all__ = ["UntilInterrupted", "pictures_possible", "save_pictures", "share_cores"]
-
 T = TypeVar("T")
 
 

@@ -17,19 +17,6 @@ if TYPE_CHECKING:
     from torchpose.priors._upper_body_prior import UpperBodyPrior
     from torchpose.upper_body._pose_track import PoseTrack
 
-__all__ = [
-    "MEAN_POSE",
-    "Hidden",
-    "Scores",
-    "beaten",
-    "demo_keypoints",
-    "perform",
-    "report",
-    "score",
-    "score_mean_pose",
-    "track_clip",
-]
-
 _FPS = 30.0
 _STD_PX = 3.0
 _GAP_JOINT, _GAP_START, _GAP_LENGTH = "hand_right", 2.6, 1.0

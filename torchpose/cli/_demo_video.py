@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from torchpose.video._recording import TrackedPerson
     from torchpose.video._video_tracker import VideoTracker
 
-__all__ = ["demo_video"]
-
 _FPS = 30.0
 _DISTANCE = 1.8  # metres: near enough for the face, far enough for raised arms
 

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from torchpose.demo._rendering.walk import Walk
 
-__all__ = ["demo_walk"]
-
 _FPS = 30.0
 _HEIGHT = 1.8
 _PARTICLES = 500

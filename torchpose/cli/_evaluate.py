@@ -14,8 +14,6 @@ from torchpose.cli._command import add_options, new_parser
 from torchpose.cli._options import REQUIRED, Option, documented, options_of
 from torchpose.errors import InputError
 
-__all__ = ["BENCHMARKS", "PROTOCOLS", "Protocol", "build", "checked_data", "execute", "main"]
-
 Data = Literal["folder", "recordings", "mocap"]
 _COMMON = ("data", "out", "seed", "progress", "prior")
 _MOVED = "earlier-*/*"

@@ -15,8 +15,6 @@ from torchpose.errors import InputError
 if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
 
-__all__ = ["KINDS", "PYTHON_ONLY", "command", "main", "recorded_command"]
-
 _EXAMPLES = {
     "manifold": "torchpose fit manifold walks/ --out walk.safetensors --persons anna ben --held-out carl\n"
     "torchpose fit manifold walks/ --out anna.safetensors --persons anna --validation 2",

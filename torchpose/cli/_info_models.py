@@ -5,8 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["DESCRIBED", "describe_body_poses"]
-
 Facts = dict[str, str]
 _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
 

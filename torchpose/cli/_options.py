@@ -15,8 +15,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Union
 
-__all__ = ["REQUIRED", "Option", "documented", "options_of", "options_of_methods", "summary_of"]
-
 REQUIRED = inspect.Parameter.empty
 """The default of what has to be given."""
 

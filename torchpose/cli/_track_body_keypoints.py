@@ -47,8 +47,6 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_track import BodyTrack
     from torchpose.whole_body._body_tracker import BodyTracker
 
-__all__ = ["KeypointSettings", "first_state", "track_keypoints"]
-
 _CAMERAS = "refined_cameras.toml"
 _FPS = 30.0  # frames per second with which options are checked before inputs are read
 _SAME_RATE = 0.01  # relative: of videos that are not resampled

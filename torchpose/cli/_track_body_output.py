@@ -17,19 +17,6 @@ if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
     from torchpose.whole_body._body_track import BodyTrack
 
-__all__ = [
-    "KALMAN",
-    "BodyJob",
-    "action_text",
-    "body_results",
-    "draw",
-    "gate_is_in_a_note",
-    "project_joints",
-    "summary",
-    "write_page",
-    "write_people",
-]
-
 KALMAN = "kalman"
 """The method that takes nothing but keypoints, and is their default."""
 _POSES = ("body.npz", "joints.csv")

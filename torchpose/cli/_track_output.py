@@ -17,20 +17,6 @@ _PICTURES = ("pose_strip.png", "joint_curves.png")
 _VIDEO = ("overlay.mp4", "report.html")
 _OWN = r"poses(_p\d\d+)?\.(npz|csv|bvh)|overlay\.mp4|report\.html|(pose_strip|joint_curves)\.png"
 
-__all__ = [
-    "TrackingJob",
-    "camera_text",
-    "percent",
-    "person_suffix",
-    "report_failure",
-    "smoothing_text",
-    "summary",
-    "track_pictures",
-    "track_results",
-    "write_pictures",
-    "write_track",
-]
-
 
 class TrackingJob(NamedTuple):
     """Holds the input, the settings and the output folder of one run of tracking.

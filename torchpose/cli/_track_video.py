@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 _OVERLAY = "overlay.mp4"
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
 
-__all__ = ["track_video", "write_overlay", "write_people"]
-
 
 def track_video(
     job: TrackingJob, options: dict[str, Any], face_model: str | None, overlay: bool

@@ -23,8 +23,6 @@ from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
 from torchpose.math._rotations import euler_to_matrix, rotvec_to_matrix
 
-__all__ = ["ANGLE_LIMITS", "BodyAngles", "BodySize", "angles_to_joints", "raised_shoulder"]
-
 ANGLE_LIMITS = {
     "abduction": (-60.0, 165.0),
     "flexion": (-40.0, 165.0),

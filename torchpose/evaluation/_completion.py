@@ -20,8 +20,6 @@ from torchpose.io._recordings import Recording
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 
-__all__ = ["Completion", "complete", "facing_pieces", "learn_completion", "with_wrists"]
-
 _KNOWN = ("hip_center", "shoulder_left", "shoulder_right", "elbow_left", "elbow_right",
           "wrist_left", "wrist_right")  # fmt: skip
 _HIP, _LEFT, _RIGHT = 0, 1, 2

@@ -40,8 +40,6 @@ from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.skeleton._upper_body import upper_body_indices
 
-__all__ = ["run"]
-
 _UTD, _MHAD = "kinect_utd_mhad", "mocap_berkeley_mhad"
 _KINECT = (_UTD, "burke_kinect", "kinect_laban")
 _MOCAP = (_MHAD, "mocap_cmu_walk", "mocap_cmu_actions")

@@ -15,8 +15,6 @@ from torchpose.evaluation._person_tables import (
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._unseen import Scored
 
-__all__ = ["Crossed", "add_added", "add_cross", "plot_cross"]
-
 
 class Crossed(NamedTuple):
     """Holds the settings of the comparison of data sets.

@@ -41,8 +41,6 @@ from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
-__all__ = ["cyclic_subsets", "halves", "run"]
-
 _PUBLISHED, _FURTHER = "kinect_utd_mhad", ("burke_kinect", "kinect_laban")
 """Data sets that are taken from a folder that holds them, without being named."""
 _PUBLISHED_COUNTS = (1, 2, 4, 7, 9)

@@ -32,8 +32,6 @@ from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_setting
 from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
-__all__ = ["run"]
-
 
 def run(
     data: Sequence[str | Path] | str | Path,

@@ -14,18 +14,6 @@ from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._curation.joints import measured, runs
 from torchpose.learning._curation.splits import same_names
 
-__all__ = [
-    "LEAST_FRAMES",
-    "POSE_CLASSES",
-    "KnownPersons",
-    "by_person",
-    "complete_pieces",
-    "pose_classes",
-    "read_known_persons",
-    "renamed",
-    "spread",
-]
-
 LEAST_FRAMES = 10
 """Of a sequence that is scored."""
 

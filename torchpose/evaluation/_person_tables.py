@@ -10,18 +10,6 @@ from torchpose.evaluation._report import Report, Table
 from torchpose.evaluation._unseen import Scored
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = [
-    "SHORT_NAMES",
-    "Curve",
-    "add_persons",
-    "add_pose_classes",
-    "class_error",
-    "mean_error",
-    "plot_curves",
-    "plot_persons",
-    "pooled",
-]
-
 SHORT_NAMES = tuple(name.replace("_left", " L").replace("_right", " R") for name in UPPER_BODY)
 """Names of the joints at the heads of columns."""
 

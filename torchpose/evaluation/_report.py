@@ -14,8 +14,6 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.io._results import replace_own
 
-__all__ = ["RESULTS", "Report", "Table"]
-
 RESULTS = "evaluate"
 """Kind of the files in the folder of a protocol, for `torchpose.io._results.replace_own`."""
 

@@ -54,8 +54,6 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior, load_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator_table import METHODS, choose_method, method_options
 
-__all__ = ["run"]
-
 _SEEN = {"head+hands": MEASURED, "all": UPPER_BODY}
 _DEFAULT_RATE = 30.0
 

@@ -32,27 +32,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator_table import choose_method
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
-__all__ = [
-    "CAMERA",
-    "HANDS",
-    "MEASURED",
-    "TEST_ANGLES",
-    "TEST_TRANSLATION",
-    "Estimate",
-    "Recipe",
-    "Trials",
-    "add_picture",
-    "cached_prior",
-    "centred_on_neck",
-    "draw_picture",
-    "keep",
-    "make_test_set",
-    "own_method",
-    "read_kept",
-    "settings_hash",
-    "track",
-]
-
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 """The camera that test sequences are seen by."""
 

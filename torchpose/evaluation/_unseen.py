@@ -43,21 +43,6 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 
-__all__ = [
-    "LEVELS",
-    "QUICK",
-    "Job",
-    "ScoreSettings",
-    "Scored",
-    "compare",
-    "fit_settings",
-    "log_likelihood",
-    "poses_to_score",
-    "run_jobs",
-    "score_person",
-    "training_neck",
-]
-
 LEVELS = (0.5, 0.9)
 """Of the ellipsoids whose coverage is counted."""
 

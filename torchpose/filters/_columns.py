@@ -18,8 +18,6 @@ from torchpose.filters._outputs import FilterOutput, finish_output
 from torchpose.filters._weights import WeightRule, indicator_mixing, steps_between_rescaling
 from torchpose.math._gaussian import least_exponent
 
-__all__ = ["run_columns", "suits_columns"]
-
 _LEAST_BATCH = 16  # below, the calls cost more than the arithmetic, and blocks of frames are faster
 _MOST_COLUMNS = 96  # more sequences at a time fall out of the cache
 _FRAMES = 4  # at a time

@@ -13,8 +13,6 @@ from torchpose.filters._measurements import check_lengths
 from torchpose.filters._recursive_filter import check_lag
 from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
 
-__all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
-
 _SETTLED = 1e-13
 _MOST_STEPS = 10_000
 _VELOCITY_VARIANCE = 100.0  # at the start, in units of r per s^2

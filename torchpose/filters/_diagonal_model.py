@@ -23,8 +23,6 @@ from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._transition import inflation
 from torchpose.math._gaussian import mended_cholesky, safe_cholesky, spare_columns, symmetrise
 
-__all__ = ["DiagonalModel", "DiagonalMoves", "diagonal_model", "diagonal_moves"]
-
 
 class DiagonalModel(NamedTuple):
     """Holds the model of every component in coordinates of its own, x = mu + V y.

@@ -26,8 +26,6 @@ from torchpose.filters._track_steps import run_steps, step_estimate
 from torchpose.filters._weights import WeightRule
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["FixedTrackFilter"]
-
 _WEIGHTINGS = ("sequence", "frame")
 _UNIFORM_WEIGHT = 1e-3
 

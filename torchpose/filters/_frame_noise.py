@@ -24,17 +24,6 @@ from torchpose.filters._recompute import wants_gradient
 from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
 from torchpose.math._geometric_median import geometric_median, median_columns
 
-__all__ = [
-    "FrameNoise",
-    "MeasuredParts",
-    "OwnFrames",
-    "condition_own",
-    "frame_noise",
-    "log_normaliser",
-    "measured_parts",
-    "own_moments",
-]
-
 
 class FrameNoise(NamedTuple):
     """Holds the noise of frames with gaps, S = R' + b C, of any number of frames [..., Z, Z].

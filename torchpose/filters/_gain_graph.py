@@ -21,16 +21,6 @@ from torchpose.filters._outputs import Mending
 from torchpose.filters._transition import Transition
 from torchpose.math._gaussian import kalman_gain, symmetrise
 
-__all__ = [
-    "BlockModel",
-    "Edge",
-    "GainGraph",
-    "History",
-    "find_history",
-    "mending_of_edges",
-    "shares_gains",
-]
-
 _SETTLED = 4e-13
 _MOST_EDGES = 1024
 _SETTLING = 32  # frames until gains are constant, as a rule

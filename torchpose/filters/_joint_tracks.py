@@ -33,20 +33,6 @@ from torchpose.filters._outputs import (
 from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
-__all__ = [
-    "TRACK_NUMBERS",
-    "JointModel",
-    "JointProblem",
-    "JointTracks",
-    "joined",
-    "joint_chunks",
-    "joint_estimate",
-    "joint_model",
-    "joint_order",
-    "joint_problems",
-    "stacked",
-]
-
 TRACK_NUMBERS = 1 << 18
 """Numbers in the tracks that are stepped at a time: 2 MB, which stay in the cache."""
 

@@ -16,16 +16,6 @@ from torchpose._core.checks import (
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError, ShapeError
 
-__all__ = [
-    "Measurements",
-    "as_covariance",
-    "check_lengths",
-    "check_noise",
-    "check_values",
-    "given_covariance",
-    "given_initial_cov",
-]
-
 
 class Measurements(NamedTuple):
     """Holds the checked measurements of a batch of sequences.

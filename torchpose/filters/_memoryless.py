@@ -32,15 +32,6 @@ from torchpose.filters._weights import WeightRule, estimate_of, frame_weights, n
 from torchpose.math._gaussian import Gain, kalman_gain
 from torchpose.math._geometric_median import median_estimate
 
-__all__ = [
-    "Wanted",
-    "conditioned_groups",
-    "frame_log_likelihood",
-    "run_memoryless",
-    "run_with_context",
-    "step_memoryless",
-]
-
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
 _OWN_FRAMES = 8  # at a time, where each has gains of its own

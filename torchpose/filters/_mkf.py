@@ -34,8 +34,6 @@ from torchpose.filters._transition import (
 from torchpose.filters._weights import normalise
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["MKFState", "MixtureKalmanFilter"]
-
 
 class MKFState(NamedTuple):
     """Holds weighted Kalman tracks.

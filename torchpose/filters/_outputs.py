@@ -11,18 +11,6 @@ from torch import Tensor
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import DegenerateFilterWarning
 
-__all__ = [
-    "FilterOutput",
-    "Mending",
-    "StepOutput",
-    "collect",
-    "effective_sample_size",
-    "finish_output",
-    "first_not_finite",
-    "mending",
-    "stacked_mending",
-]
-
 
 class StepOutput(NamedTuple):
     """Holds the estimate after one time step.

@@ -14,8 +14,6 @@ from torchpose.filters._weights import estimate_of
 from torchpose.math._geometric_median import geometric_median, median_columns
 from torchpose.math._half_planes import outside_moments
 
-__all__ = ["OutsidePoint", "with_outside_point"]
-
 
 class OutsidePoint(NamedTuple):
     """Evidence of B T frames that a point of the state is outside of a region.

@@ -27,8 +27,6 @@ from torchpose.filters._outputs import FilterOutput, Mending, finish_output, men
 from torchpose.filters._weights import WeightRule, sequence_weights
 from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
-__all__ = ["run_own_histories"]
-
 _STATE_NUMBERS = 300_000  # of tracks at a time: 2.4 MB, which stay in the cache
 _SPAN_NUMBERS = 1 << 20  # of their means over a span of frames
 _COV_NUMBERS = 1 << 21  # of their covariances, where these are asked for

@@ -39,8 +39,6 @@ from torchpose.math._gaussian import mended_update, safe_cholesky
 from torchpose.math._mixture_steps import MixtureParameters
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
-
 PROPOSALS = ("mixture", "random-walk", "random-walk-unscaled")
 _STARTS = ("prior", "measured")
 

@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
-__all__ = ["RECOMPUTED_FRAMES", "recomputed", "wants_gradient"]
-
 RECOMPUTED_FRAMES = 16
 """Frames at a time that filters compute anew for gradients."""
 

@@ -32,16 +32,6 @@ from torchpose.filters._measurements import (
 )
 from torchpose.filters._outputs import FilterOutput, StepOutput, collect
 
-__all__ = [
-    "Generators",
-    "RecursiveFilter",
-    "check_generators",
-    "check_lag",
-    "require_state",
-    "standard_normal",
-    "uniform",
-]
-
 Generators = torch.Generator | Sequence[torch.Generator] | None
 """One generator, a list of one for each element of the batch, or None for PyTorch's own."""
 

@@ -13,20 +13,6 @@ from torchpose._core.checks import check_choice, check_positive, check_shape
 from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators, uniform
 
-__all__ = [
-    "LEAST_SURVIVORS",
-    "RESAMPLING",
-    "check_survival_rate",
-    "multinomial",
-    "resample",
-    "residual",
-    "stratified",
-    "survival_exponent",
-    "survival_rate",
-    "survival_rate_per_frame",
-    "systematic",
-]
-
 BELOW_ONE = 1.0 - 2.0**-53  # the largest float64 under 1: (n - 1 + u) / n may round up to 1
 
 

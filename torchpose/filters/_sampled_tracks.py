@@ -29,8 +29,6 @@ from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_predict, mended_update
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["SampledTrackFilter"]
-
 
 class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     """Filters by a mixture Kalman filter whose M tracks draw a component from pi in every frame.

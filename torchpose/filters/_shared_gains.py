@@ -27,8 +27,6 @@ from torchpose.filters._outputs import FilterOutput, StepOutput, finish_output
 from torchpose.filters._recompute import RECOMPUTED_FRAMES, recomputed
 from torchpose.filters._weights import WeightRule, sequence_weights, within_and_between
 
-__all__ = ["run_for_gradients", "run_shared"]
-
 _BUFFER_NUMBERS = 1 << 18  # track means held at a time: 4 MB, which stay in the cache
 
 

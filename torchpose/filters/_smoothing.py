@@ -25,8 +25,6 @@ from torchpose.filters._track_steps import step_tracks, weigh_tracks
 from torchpose.filters._weights import WeightRule, mix_uniform, normalise, within_and_between
 from torchpose.math._gaussian import mended_cholesky, symmetrise
 
-__all__ = ["smooth_fixed_tracks"]
-
 _BUFFER_NUMBERS = 1 << 26  # numbers held for one part of the batch: half a gigabyte
 
 

@@ -19,8 +19,6 @@ from torchpose._core.module_state import derived
 from torchpose.filters._joint_tracks import JointProblem, JointTracks, joint_model
 from torchpose.filters._mkf import MixtureKalmanFilter
 
-__all__ = ["block_numbers", "candidate_log_likelihood"]
-
 _LOGS = 4  # pivots whose product is within range, and costs one logarithm
 
 

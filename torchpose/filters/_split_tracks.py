@@ -28,8 +28,6 @@ from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_correct, kalman_gain, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["SplitTrackFilter"]
-
 _MOST_SHARED = 1 << 22  # numbers, 32 MB, of the product that all frames share
 _RANKS = 1e9  # per nat: log-weights that are nearer are equal
 

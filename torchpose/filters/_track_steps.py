@@ -20,8 +20,6 @@ from torchpose.filters._transition import Transition
 from torchpose.filters._weights import WeightRule, estimate_of, mix_uniform, step_weights
 from torchpose.math._gaussian import Gain, kalman_correct, kalman_gain, symmetrise
 
-__all__ = ["TrackStep", "run_steps", "step_estimate", "step_tracks", "weigh_tracks"]
-
 
 class TrackStep(NamedTuple):
     """Holds all tracks after one step, before their weights.

@@ -15,16 +15,6 @@ from torchpose.filters._weights import normalise
 from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = [
-    "BURN_IN_SCALE",
-    "TRANSITIONS",
-    "Transition",
-    "check_transition_options",
-    "fit_gamma",
-    "inflation",
-    "make_transition",
-]
-
 TRANSITIONS = ("paper", "stationary", "ou")
 BURN_IN_SCALE = 100.0
 """Factor of Q in the first frame of a burn-in, where none is given."""

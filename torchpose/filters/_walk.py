@@ -15,8 +15,6 @@ from torchpose._core.value_checks import values_visible
 from torchpose.math._gaussian import LOG_2PI, mended_cholesky, safe_cholesky
 from torchpose.math._mixture_steps import MixtureParameters
 
-__all__ = ["MixtureWalk", "Moves", "grouped_affine"]
-
 CHUNK_ELEMENTS = 630 * 512  # residuals per product: 1.3 MB in float32, so that they stay in cache
 TILE = 32
 NEGLIGIBLE = -80.0  # exp(-80) = 2e-35: no share of a sum, and not yet denormal in float32

@@ -13,19 +13,6 @@ from torch import Tensor
 
 from torchpose.math._gaussian import least_exponent
 
-__all__ = [
-    "WeightRule",
-    "estimate_of",
-    "frame_weights",
-    "indicator_mixing",
-    "mix_uniform",
-    "normalise",
-    "sequence_weights",
-    "step_weights",
-    "steps_between_rescaling",
-    "within_and_between",
-]
-
 
 class WeightRule(NamedTuple):
     """Holds the settings of the weights of fixed tracks.

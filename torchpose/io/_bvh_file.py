@@ -12,8 +12,6 @@ from torch import Tensor
 from torchpose._core.files import atomic_path
 from torchpose.math._rotations import matrix_to_euler
 
-__all__ = ["BvhNode", "bvh_angles", "write_bvh_motion"]
-
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 _NOWHERE = (0.0, 0.0, 0.0)
 

@@ -17,8 +17,6 @@ from torchpose._core.checks import check_rate, check_shape
 from torchpose._core.files import atomic_path
 from torchpose.errors import InputError
 
-__all__ = ["write_c3d"]
-
 _BLOCK = 512
 _MILLIMETRES = 1000.0
 _LARGEST_RESIDUAL = 255  # millimetres: a byte

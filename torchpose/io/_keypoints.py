@@ -29,8 +29,6 @@ from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 from torchpose.skeleton._upper_body import NECK_KINDS
 
-__all__ = ["Keypoints", "read_keypoints", "said_of_crowd", "write_keypoints"]
-
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
 _NORMALISED = 2.0  # no more are shares of the image, in which joints may lie outside

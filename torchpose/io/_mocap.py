@@ -16,8 +16,6 @@ from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording, read_recordings
 
-__all__ = ["MocapClip", "read_mocap", "resample_frames"]
-
 _UNNAMED = "unnamed"
 
 

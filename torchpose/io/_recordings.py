@@ -29,8 +29,6 @@ from torchpose.io._formats.skeleton_files import read_azure_json, read_kinect_v1
 from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._upper_body import UpperBody, to_upper_body
 
-__all__ = ["Recording", "find_recordings", "read_recording", "read_recordings"]
-
 _READERS: dict[str, Callable[[Path], list[RawRecording]]] = {
     ".npz": read_npz_recording,
     ".yaml": read_opencv_recording,

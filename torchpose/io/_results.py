@@ -15,8 +15,6 @@ from torchpose._core.files import atomic_path, check_output_folder, hold
 from torchpose._core.reading import npz_keys
 from torchpose.errors import OutputError, TorchposeError
 
-__all__ = ["ResultsFolder", "holds_arrays", "refuse_stranger", "replace_own"]
-
 _LISTED = 5
 
 

@@ -9,8 +9,6 @@ from torch import Tensor
 from torchpose._core.checks import check_rate, check_shape
 from torchpose._core.files import atomic_path
 
-__all__ = ["write_trc"]
-
 
 def write_trc(
     path: str | Path,

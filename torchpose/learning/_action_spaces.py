@@ -16,12 +16,6 @@ from torchpose.priors._actions.action_file import ActionInfo
 from torchpose.priors._actions.polar_limbs import POSTURE_DIM
 from torchpose.priors._actions.space import ActionSpace
 
-__all__ = [
-    "Performed",
-    "fit_action_space",
-    "fit_synchronised",
-]
-
 _STD_FLOOR = 0.1  # of a dimension's deviation over the whole performance
 _LEAST_STD = 0.1  # degrees
 _SMALLEST_VARIANCE = 1e-10  # of the largest; below it a direction is rounding

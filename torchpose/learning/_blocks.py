@@ -12,8 +12,6 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.learning._samplers import BLOCK, PRODUCT, Samples, SampleSource, join_samples
 
-__all__ = ["ALONE", "Share", "joined_blocks", "spread_samples", "usable_block", "usable_samples"]
-
 K = TypeVar("K")
 _START_BLOCKS = 4  # times the blocks that the samples would fill, for variety
 

@@ -22,17 +22,6 @@ from torchpose.math._rotations import quaternion_vector_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = [
-    "BodyMotionRecipe",
-    "Mirror",
-    "MotionSequence",
-    "acceleration_ratio",
-    "fit_body_motion",
-    "mirror_of",
-    "motion_sequence",
-    "pose_log_density",
-]
-
 _NEAR, _FAR = 1 / 30, 1 / 15  # seconds, lags between which velocities tell their decay
 _DECAYS = (0.3, 15.0)  # per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5

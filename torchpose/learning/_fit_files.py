@@ -17,17 +17,6 @@ from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
-__all__ = [
-    "check_fit_file",
-    "fit_results",
-    "write_action_files",
-    "write_body_files",
-    "write_fit",
-    "write_limb_files",
-    "write_manifold_files",
-    "write_prior_files",
-]
-
 
 def check_fit_file(name: str | Path) -> Path:
     """Return the path of the file that a fit is to write.

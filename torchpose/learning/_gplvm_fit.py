@@ -15,17 +15,6 @@ from torchpose.errors import InputError
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.priors._manifold.prediction import KernelParameters, covariance, rbf
 
-__all__ = [
-    "OPTIMISERS",
-    "GPLVMFit",
-    "best_fit",
-    "log_likelihood",
-    "median_gamma",
-    "objective",
-    "principal_start",
-    "run_fit",
-]
-
 OPTIMISERS = ("lbfgs", "adam")
 LOG_2PI = math.log(2 * math.pi)
 _PER_STEP = 10  # iterations of the optimiser in a step

@@ -24,8 +24,6 @@ from torchpose.priors._limb_conditionals import (
     check_body_frame,
 )
 
-__all__ = ["edge_rotations", "fit_limb_conditionals", "frame_rotations", "part_rotations"]
-
 _MOST_CANDIDATES = 2000  # training rotations that a centre is looked for among
 _STRIDES = (2, 3, 4)  # frames, over which the growth of diffusion is looked at
 

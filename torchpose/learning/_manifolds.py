@@ -16,21 +16,6 @@ from torchpose.learning._gplvm_fit import GPLVMFit, best_fit, median_gamma
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM, MotionNoise, join_sequences
 from torchpose.priors._manifold.manifold_file import ManifoldInfo
 
-__all__ = [
-    "FitTarget",
-    "check_unseen",
-    "column_scale",
-    "fit_gplvm",
-    "fit_gplvm_noise",
-    "fit_target",
-    "gplvm_of_fit",
-    "motion_noise",
-    "principal_axes",
-    "steps_growth",
-    "steps_within",
-    "thin",
-]
-
 _WATCHED, _ALONE = {"steps": 40, "n_init": 4}, {"steps": 3, "n_init": 1}
 _LEAST_SHARE = 0.05  # of the root mean square over all columns: a deviation that is not nothing
 _STRIDES = (2, 3, 4)  # frames, over which the growth of steps is looked at

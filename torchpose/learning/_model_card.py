@@ -17,16 +17,6 @@ from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 
-__all__ = [
-    "MODES",
-    "BodyModel",
-    "body_card",
-    "card_table",
-    "card_text",
-    "model_card",
-    "write_model_card",
-]
-
 MODES = {"pose": "single poses", "causal": "filtered", "full": "smoothed"}
 """What cards and commands call the ways of tracking."""
 

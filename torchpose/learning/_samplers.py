@@ -20,22 +20,6 @@ from torchpose.errors import InputError
 from torchpose.priors._arm_state import arm_state
 from torchpose.priors._window import WindowLayout, augment_bodies, mirror_bodies, window_state
 
-__all__ = [
-    "BLOCK",
-    "PRODUCT",
-    "ArmSource",
-    "CachedSource",
-    "PoseFrames",
-    "SampleSource",
-    "Samples",
-    "TensorSource",
-    "WindowSource",
-    "all_samples",
-    "cached",
-    "derived_seed",
-    "join_samples",
-]
-
 BLOCK = 4096
 PRODUCT = 8 * BLOCK  # states per product: single blocks take a third more time
 _CACHE_BYTES = 1 << 30

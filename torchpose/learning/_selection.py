@@ -16,8 +16,6 @@ from torchpose.learning._samplers import SampleSource
 from torchpose.learning._streamed_em import StartOptions, StreamedEM, run_streamed
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["RULES", "Candidate", "Selection", "held_out_scores", "select_n_components"]
-
 RULES = ("best", "one-standard-error")
 
 

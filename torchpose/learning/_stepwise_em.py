@@ -26,14 +26,6 @@ from torchpose.math._mixture_steps import (
     upper_triangle,
 )
 
-__all__ = [
-    "StepwiseState",
-    "implied_statistics",
-    "stepwise_pass",
-    "stepwise_start",
-    "stepwise_update",
-]
-
 # Of powers 0.6 to 1 and 1 to 8 blocks, the smaller the further a pass came, on drawn and on recorded
 # states; two blocks let two processes work at a time.
 BLOCKS_PER_STEP = 2

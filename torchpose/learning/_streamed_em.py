@@ -43,17 +43,6 @@ from torchpose.math._mixture_steps import (
 )
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = [
-    "START_SAMPLES",
-    "ColumnsSource",
-    "MixtureTask",
-    "StartOptions",
-    "StreamedEM",
-    "complete_mixture",
-    "fit_streamed",
-    "run_streamed",
-]
-
 START_SAMPLES = 100_000
 
 

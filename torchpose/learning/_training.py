@@ -20,21 +20,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import learn_neck_offset, place_neck
 from torchpose.skeleton._upper_body import LEFT_ARM, NECK_KINDS, RIGHT_ARM, upper_body_indices
 
-__all__ = [
-    "MIRROR",
-    "TRAINING_VIEWS",
-    "ArmPoses",
-    "ArmSources",
-    "PoseSet",
-    "RecordingLike",
-    "arm_poses",
-    "arm_sources",
-    "collect_poses",
-    "one_kind",
-    "seen_keypoints",
-    "short_paths",
-]
-
 TRAINING_VIEWS = ViewRange(
     roll=math.radians(15),
     pitch=math.radians(15),

@@ -39,8 +39,6 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = ["KINECT_CAMERA", "fit_upper_body_prior", "increment_covs", "prior_of_arms"]
-
 KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
 """fx, fy, cx, cy of a Kinect's camera at 640 x 480, pixels."""
 

@@ -15,25 +15,6 @@ from torch.nn.functional import pad
 
 from torchpose._core.value_checks import values_visible
 
-__all__ = [
-    "Gain",
-    "condition",
-    "kalman_correct",
-    "kalman_gain",
-    "kalman_predict",
-    "kalman_update",
-    "least_exponent",
-    "log_prob",
-    "marginal",
-    "mended_cholesky",
-    "mixture_moments",
-    "product",
-    "safe_cholesky",
-    "safe_eigh",
-    "spare_columns",
-    "symmetrise",
-]
-
 LOG_2PI = math.log(2 * math.pi)
 _JITTER = (1e-14, 1e-12, 1e-10, 1e-8, 1e-6)
 _LEAST_VARIANCE = 1e-18  # of a matrix of zeros, such as the covariance of a single particle

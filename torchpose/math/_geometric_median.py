@@ -4,8 +4,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-__all__ = ["geometric_median", "median_columns", "median_estimate"]
-
 _STEPS = 5
 _LEAST = 1e-18  # of a squared distance, where a mean has no spread and is hit
 

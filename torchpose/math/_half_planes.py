@@ -8,8 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.special import log_ndtr
 
-__all__ = ["OutsideMoments", "log_outside", "outside_moments"]
-
 _LOG_2PI = math.log(2 * math.pi)
 
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from torchpose._core.checks import check_finite, check_shape, check_weights
 from torchpose.math._mixture_steps import MixtureParameters
 
-__all__ = ["STARTS", "floor_variances", "k_means", "start_mixture"]
-
 STARTS = ("k-means++", "random")
 CHUNK = 8192
 

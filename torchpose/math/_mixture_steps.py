@@ -18,21 +18,6 @@ from torch import Tensor
 from torchpose.errors import CovarianceError
 from torchpose.math._gaussian import least_exponent, symmetrise
 
-__all__ = [
-    "CyclicFeatures",
-    "FitReport",
-    "MixtureParameters",
-    "SufficientStatistics",
-    "cyclic_order",
-    "e_step",
-    "feature_sums",
-    "m_step",
-    "moments",
-    "natural_parameters",
-    "product_places",
-    "upper_triangle",
-]
-
 
 class CyclicFeatures:
     """Computes phi(x) = [1, x_i, x_i x_(i + s mod D)] of chunk after chunk of points.

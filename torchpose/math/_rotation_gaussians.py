@@ -20,19 +20,6 @@ from torchpose.errors import InputError
 from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._unscented import Directions, moments, sigma_points
 
-__all__ = [
-    "angle_to_edge",
-    "fit_gaussian",
-    "gaussian_rotate",
-    "left_matrix",
-    "quaternion_moments",
-    "right_matrix",
-    "rotate_gaussian",
-    "safe_centre",
-    "sigma_quaternions",
-    "turn_gaussian",
-]
-
 _CHUNK = 1 << 22  # products of two quaternions at a time, 32 MB
 
 # a b = _LEFT(a) b = _RIGHT(b) a for quaternions (x, y, z, w): row i, column j holds the entry of the

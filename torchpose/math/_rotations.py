@@ -18,28 +18,6 @@ from torchpose._core.checks import check_choice, check_shape
 from torchpose._core.module_state import outside_inference
 from torchpose.math._gaussian import safe_eigh
 
-__all__ = [
-    "ROTATION_ORDERS",
-    "RigidMotion",
-    "RotationOrder",
-    "compose",
-    "conjugate",
-    "cross_matrix",
-    "euler_to_matrix",
-    "exponential",
-    "matrix_to_euler",
-    "matrix_to_quaternion_vector",
-    "mean_rotation",
-    "minimal_rotation",
-    "procrustes",
-    "quaternion_to_vector",
-    "quaternion_vector_to_matrix",
-    "rotvec_to_matrix",
-    "vector_to_quaternion",
-    "within_half_turn",
-    "within_unit_ball",
-]
-
 RotationOrder = Literal["zxy", "zyx"]
 ROTATION_ORDERS: tuple[RotationOrder, ...] = ("zxy", "zyx")
 

@@ -16,8 +16,6 @@ from torchpose._core.checks import check_shape
 from torchpose.errors import ShapeError, SkeletonError
 from torchpose.math._gaussian import safe_cholesky
 
-__all__ = ["MessageTree", "Transport", "TreeLevel", "message_tree", "propagate", "tree_levels"]
-
 Transport = Callable[[Tensor, Tensor, Tensor, bool], tuple[Tensor, Tensor]]
 
 

@@ -18,16 +18,6 @@ from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError
 from torchpose.math._gaussian import condition, safe_cholesky, safe_eigh, symmetrise
 
-__all__ = [
-    "DIRECTIONS",
-    "Directions",
-    "floor_eigenvalues",
-    "moments",
-    "sigma_points",
-    "unscented_transform",
-    "unscented_update",
-]
-
 Directions = Literal["eigen", "cholesky"]
 DIRECTIONS: tuple[Directions, ...] = ("eigen", "cholesky")
 

@@ -13,8 +13,6 @@ from torchpose.measure._edges import ARM_LIMBS, Segments, limb_votes, segments_o
 from torchpose.measure._persons import match_states
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["AssociationState", "HandAssociation"]
-
 _HANDS = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
 
 

@@ -14,8 +14,6 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELLS, EVIDENCE, move_maps
 
-__all__ = ["BackgroundModel", "Motion", "MotionState", "dense_flow", "person_region"]
-
 _LARGEST = (320, 240)  # width and height at which the model works
 # A person's region, in sizes of the face from its centre: (half the width, height).
 _TOP, _WIDEST = (1.0, -1.2), (2.8, 2.0)  # and so wide from there to the bottom of the image

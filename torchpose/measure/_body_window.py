@@ -21,30 +21,6 @@ from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._skin import SkinModel
 
-__all__ = [
-    "CELL",
-    "CELLS",
-    "COLOURS",
-    "EVIDENCE",
-    "ScaledFrame",
-    "cell_axes",
-    "cell_centres",
-    "cells_to_pixels",
-    "cut_colours",
-    "cut_mask",
-    "cut_windows",
-    "faces_in_evidence",
-    "faces_in_window",
-    "follow_faces",
-    "halve",
-    "inside_image",
-    "move_maps",
-    "pixels_to_cells",
-    "place_windows",
-    "scale_frame",
-    "scales_of_faces",
-]
-
 CELL = 0.1  # side of a cell, in B
 CELLS = (88, 96)  # rows and columns of cells
 EVIDENCE, COLOURS = 2, 4  # pixels of the finer maps for each cell

@@ -10,8 +10,6 @@ from torch import Tensor, nn
 
 from torchpose.errors import InputError, ShapeError
 
-__all__ = ["BrightnessBackground", "Distortion", "PixelKind"]
-
 _NOISE = 3.0  # grey levels: least deviation of a camera's pixel, rounding and codec included
 _LEAST_BRIGHTNESS = 0.01  # of the rms of alpha - 1, where a background hardly varies
 _DARK = 12.0  # grey levels: a background darker than this has no chromaticity to speak of

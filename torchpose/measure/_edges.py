@@ -13,8 +13,6 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["ARM_LIMBS", "Segments", "edge_map", "find_segments", "limb_votes", "segments_of_arms"]
-
 Backend = Literal["auto", "opencv", "kornia"]
 ARM_LIMBS = tuple(
     (UPPER_BODY.index(f"{upper}_{side}"), UPPER_BODY.index(f"{lower}_{side}"))

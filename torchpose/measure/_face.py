@@ -16,17 +16,6 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
 
-__all__ = [
-    "FaceDetector",
-    "FaceTracker",
-    "FaceTracks",
-    "HaarFaceDetector",
-    "Region",
-    "check_faces",
-    "nearest_pairs",
-    "scaled_back",
-]
-
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is

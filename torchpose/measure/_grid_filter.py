@@ -12,16 +12,6 @@ from torchpose._core.module_state import outside_inference
 
 _LEAST = 1e-12  # belief in a cell: denormal numbers are slow
 
-__all__ = [
-    "GridEstimate",
-    "blur",
-    "exclude",
-    "gaussian_bump",
-    "gaussian_matrix",
-    "predict",
-    "read_out",
-]
-
 
 class GridEstimate(NamedTuple):
     """Holds the estimate that is read from a belief over a grid, in cells.

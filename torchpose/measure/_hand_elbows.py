@@ -16,8 +16,6 @@ from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
 from torchpose.measure._hand_network import HandPlaces
 from torchpose.measure._torso_elbows import Elbows
 
-__all__ = ["expected_elbows", "find_elbows", "in_frame"]
-
 _FREEDOM = 4.0  # of the Student distribution of an elbow given the hand
 
 

@@ -11,8 +11,6 @@ from torch.nn.functional import conv2d, conv_transpose2d, interpolate
 
 from torchpose._core.module_state import outside_inference
 
-__all__ = ["Layer", "UpwardLayer", "for_inference"]
-
 Network = TypeVar("Network", bound=nn.Module)
 
 

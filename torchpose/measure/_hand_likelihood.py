@@ -16,9 +16,6 @@ from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, cell_centres, halve
 from torchpose.measure._face import check_faces
 
-__all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", "no_hands"]
-
-
 _ACROSS = torch.tensor([-1.0, 1.0])[:, None, None]  # turns (y, x) into the vector across
 
 

@@ -19,8 +19,6 @@ from torchpose._core.tensor_file import FileKind
 from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
 from torchpose.measure._hand_layers import Layer, UpwardLayer, for_inference
 
-__all__ = ["COARSE", "HandNetwork", "HandNetworkInfo", "HandPlaces", "shipped_hand_network"]
-
 COARSE = (CELLS[0] // 2, CELLS[1] // 2)
 """Rows and columns of the network's own cells, twice as wide as those of the window."""
 

@@ -12,8 +12,6 @@ from torchpose.errors import InputError
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
-__all__ = ["FACE_HEIGHT", "HandPrior"]
-
 FACE_HEIGHT = 0.165  # metres: side of the bounding box of the face detector, B
 _STEP, _LEFT, _TOP, _SIZE = 0.1, -5.0, -2.5, (91, 101)  # the tables, in B from the face
 _HAND, _ELBOW, _HEAD, _DEPTH = slice(0, 2), slice(3, 5), slice(9, 11), 11

@@ -31,8 +31,6 @@ from torchpose.measure._head import head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import PersonParts, SkinModel, parts_of_persons
 
-__all__ = ["HandView", "HandWindowState", "HandWindows"]
-
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
 

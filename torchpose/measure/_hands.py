@@ -38,8 +38,6 @@ from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
 
-__all__ = ["HandBeliefs", "HandState", "HandTracker"]
-
 _NEAR = 4  # cells about a hand that belong to it
 _UNKNOWN, _SUREST = 0.5, 1e-3  # probability that a hand is gone: at first, and at the least
 

@@ -12,17 +12,6 @@ from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, COLOURS, EVIDENCE, cell_centres, faces_in_window
 
-__all__ = [
-    "FACE_OFFSETS",
-    "WITHOUT_ELBOWS",
-    "FaceMemory",
-    "FaceMemoryState",
-    "FaceOffsets",
-    "HeadNeck",
-    "head_mask",
-    "head_part",
-]
-
 _ROWS, _COLUMNS = 104, 72  # of the remembered patch: head and neck
 _HALF_WIDTH, _TOP, _HEIGHT = 1.0, -1.0, 2.6  # of the patch, in B from the face's centre
 _SEARCH = 8  # pixels of the patch to each side

@@ -30,8 +30,6 @@ from torchpose.measure._persons import PersonRegister, Persons, largest_persons
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 
-__all__ = ["LEAST_CONFIDENCE", "FrameKeypoints", "KeypointMeasurer", "KeypointState"]
-
 LEAST_CONFIDENCE = 0.3
 """Of a keypoint, below which it counts as missing unless something else is asked for."""
 _ANYWHERE = ("head", "neck")  # may lie above the image: they follow from face and shoulders

@@ -9,8 +9,6 @@ from torch import Tensor
 from torchpose._core.checks import check_finite, check_shape
 from torchpose.errors import InputError
 
-__all__ = ["MeanShift", "mean_shift"]
-
 Kernel = Literal["box", "gaussian"]
 _SIDES_PER_STD = 4.0  # of the Gaussian kernel: its window reaches two deviations to either side
 _LEAST_MASS = 1e-6  # per pixel of the window; below it the map has no maximum to climb to

@@ -24,8 +24,6 @@ from torchpose.measure._mean_shift import mean_shift
 from torchpose.measure._persons import match_states, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinModel, SkinState, parts_of_persons
 
-__all__ = ["MeanShiftHandState", "MeanShiftHandTracker"]
-
 Likelihood = Literal["back-projection", "ratio"]
 _THRESHOLDS = {"back-projection": 0.1, "ratio": 0.25}
 # Lengths in sizes of the face.

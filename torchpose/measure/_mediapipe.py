@@ -21,8 +21,6 @@ from torchpose.errors import InputError, MissingDependencyError
 from torchpose.measure._face import Region
 from torchpose.skeleton._mediapipe_landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 
-__all__ = ["MediaPipeFaceDetector", "MediaPipePose", "PoseLandmarks"]
-
 
 class _Task:
     """Closes a task of MediaPipe at the end of a `with` block."""

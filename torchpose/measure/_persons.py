@@ -11,17 +11,6 @@ from torch import Tensor, nn
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 
-__all__ = [
-    "PersonRegister",
-    "Persons",
-    "clothes_colours",
-    "largest_persons",
-    "match_rows",
-    "match_states",
-    "measure_by_scale",
-    "take_rows",
-]
-
 State = TypeVar("State", bound=tuple[Any, ...])
 _BINS = 8
 _CLOTHES = (0.8, 1.3, 2.6)  # half the width, top and bottom below the face, in its sizes

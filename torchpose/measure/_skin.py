@@ -16,8 +16,6 @@ from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
 from torchpose.measure._face import check_faces
 
-__all__ = ["FACE_PATCH", "PersonParts", "SkinModel", "SkinState", "parts_of_persons", "rgb_to_lab"]
-
 BINS = (8, 32, 32)  # of L, a and b
 _LOWEST, _WIDTH = (0.0, -24.0, -24.0), (12.5, 2.0, 3.0)
 _KERNELS = ((0.1, 0.8, 0.1), (0.05, 0.24, 0.42, 0.24, 0.05), (0.05, 0.24, 0.42, 0.24, 0.05))

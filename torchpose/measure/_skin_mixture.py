@@ -15,8 +15,6 @@ from torchpose.math._mixture_steps import MixtureParameters, natural_parameters
 from torchpose.measure._face import check_faces
 from torchpose.measure._skin import FACE_PATCH
 
-__all__ = ["SkinMixtureModel", "SkinMixtureState"]
-
 _SAMPLES = 16  # across the middle of the face, and down
 _HAND = 0.3  # a pixel that is more probably a hand is not learnt
 _LEAST = 0.3  # least share of the samples that are learnt

@@ -11,8 +11,6 @@ from torchpose.errors import InputError
 from torchpose.measure._face import check_faces
 from torchpose.measure._skin import SkinModel, SkinState
 
-__all__ = ["Elbows", "clothes_likelihood", "elbows_from_torso"]
-
 # Lengths in sizes of the face, heights from its centre.
 _ROWS = (1.5, 4.2)  # where elbows are searched for
 _GAP = 0.3  # holes of this width do not end the torso: badges, prints, shadows

@@ -32,18 +32,6 @@ from torchpose.measure._skin import SkinState, rgb_to_lab
 from torchpose.measure._torso_elbows import Elbows, clothes_likelihood, elbows_from_torso
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
-__all__ = [
-    "HAND_TRACKERS",
-    "MEASURED",
-    "Candidates",
-    "FrameMeasurements",
-    "MeasurerState",
-    "PersonsView",
-    "SeenPersons",
-    "UpperBodyMeasurer",
-    "rounded_covariance",
-]
-
 MEASURED = ("head", "neck", "hand_left", "hand_right")
 """Names and order of the joints that are always measured; elbows follow if they are measured."""
 _ELBOWS = ("elbow_left", "elbow_right")

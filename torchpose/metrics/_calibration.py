@@ -17,17 +17,6 @@ from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
 from torchpose.math._gaussian import log_prob, safe_cholesky
 
-__all__ = [
-    "Coverage",
-    "calibration_error",
-    "chi2_cdf",
-    "chi2_quantile",
-    "coverage",
-    "mahalanobis_squared",
-    "predictive_log_likelihood",
-    "reliability",
-]
-
 RELIABILITY_LEVELS = tuple(round(0.05 * i, 2) for i in range(1, 20))
 
 

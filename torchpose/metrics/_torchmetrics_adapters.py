@@ -31,8 +31,6 @@ except ImportError as error:
         "run `pip install torchmetrics`, or use the functions in torchpose.metrics, which do not"
     ) from error
 
-__all__ = ["EllipsoidCoverage", "MeanPerJointError", "PercentageOfCorrectParts"]
-
 
 class MeanPerJointError(Metric):
     """Computes the mean distance of estimated from true joints, see `torchpose.metrics.joint_errors`.

@@ -18,17 +18,6 @@ from torchpose.math._rotations import ROTATION_ORDERS, RotationOrder, euler_to_m
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = [
-    "ANGLES",
-    "STATE_DIM",
-    "arm_state",
-    "arm_states",
-    "check_rotation_order",
-    "mirror_arm_state",
-    "mirror_covariance",
-    "mirror_mixture",
-]
-
 STATE_DIM = 21
 ANGLES = slice(15, 18)
 _PIXELS_U = (0, 3, 6, 9, 12)

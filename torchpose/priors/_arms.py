@@ -18,8 +18,6 @@ from torchpose._core.tensor_file import FileKind, read_tensors, require_tensor, 
 from torchpose.errors import InputError, PriorError
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["LENGTHS", "ArmPrior", "ArmPriorInfo", "shipped_arm_prior"]
-
 LENGTHS = ("upper_arm", "forearm", "forearm_to_hand", "shoulder_width", "head_height")
 """Lengths that an `ArmPrior` knows: shoulder to elbow, elbow to wrist, elbow to the middle of the hand,
 between the shoulders, and from Kinect's neck up to the head."""

@@ -19,8 +19,6 @@ from torchpose.errors import PriorError
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
-__all__ = ["BodyMotion", "BodyMotionInfo", "PosePull"]
-
 
 @dataclass(frozen=True)
 class BodyMotionInfo:

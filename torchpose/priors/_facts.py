@@ -2,8 +2,6 @@
 
 from typing import Any, TypedDict
 
-__all__ = ["FitFacts", "ManifoldFacts"]
-
 
 class FitFacts(TypedDict, total=False):
     """The fields of `LimbInfo` that do not follow from body and states."""

@@ -25,8 +25,6 @@ from torchpose.math._gaussian import mixture_moments, symmetrise
 from torchpose.math._mixture_em import FitReport, MixtureParameters, expectation_maximisation
 from torchpose.math._mixture_start import STARTS, floor_variances, start_mixture
 
-__all__ = ["ConditionedMixture", "GaussianMixture", "component_log_density"]
-
 LOG_2PI = math.log(2.0 * math.pi)
 CHUNK = 512  # rows per product, so that the [K D, rows] residuals stay in the cache
 SAMPLE_CHUNK = 4096  # draws per product, which gathers a factor [D, D] for each

@@ -32,15 +32,6 @@ from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._tree_messages import message_tree
 from torchpose.math._unscented import DIRECTIONS, Directions
 
-__all__ = [
-    "LEAST_STD",
-    "PART_TREE",
-    "LimbConditionals",
-    "LimbInfo",
-    "check_body_frame",
-    "in_body_frame",
-]
-
 _SIDES = ("left", "right")
 PART_TREE: tuple[tuple[str, str], ...] = (
     ("torso", "head"),

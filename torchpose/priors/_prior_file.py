@@ -23,8 +23,6 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, PriorError
 from torchpose.priors._arm_state import check_rotation_order
 
-__all__ = ["SKELETON", "PriorInfo", "check_noise", "read_prior", "write_prior"]
-
 SKELETON = "upper-body-8"
 CENTRES = ("neck", "head", "sequence")
 

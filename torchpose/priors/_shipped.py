@@ -12,16 +12,6 @@ from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 
-__all__ = [
-    "KINDS",
-    "find_model",
-    "known_models",
-    "load_action",
-    "load_body_motion",
-    "load_limb_conditionals",
-    "load_manifold",
-]
-
 WEIGHTS = Path(__file__).parent.parent / "weights"
 
 KINDS = {

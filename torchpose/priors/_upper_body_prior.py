@@ -29,8 +29,6 @@ from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo, check_noise, read_prior, write_prior
 from torchpose.priors._window import WindowPrior
 
-__all__ = ["UpperBodyPrior", "known_priors", "load_prior"]
-
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 _SIDES = ("left", "right")
 _PARTS = ("weights", "means", "covariances")

@@ -25,15 +25,6 @@ from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.skeleton._torso import in_torso_axes
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, mirror_pose, scale_bones
 
-__all__ = [
-    "WindowLayout",
-    "WindowPrior",
-    "augment_bodies",
-    "mirror_bodies",
-    "window_measurements",
-    "window_state",
-]
-
 _HANDS = {"left": (0, 7), "right": (7, 0)}  # own hand, other hand
 _TORSO_DIM = 15
 _SEEN = (0, 1, 9, 10, 12, 13)  # pixels of hand, head and neck

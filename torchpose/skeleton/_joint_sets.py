@@ -10,15 +10,6 @@ from functools import lru_cache
 
 from torchpose.errors import SkeletonError
 
-__all__ = [
-    "SKELETONS",
-    "UPPER_BODY",
-    "Skeleton",
-    "canonical_name",
-    "canonical_names",
-    "identify_skeleton",
-]
-
 UPPER_BODY = (
     "hand_left",
     "elbow_left",

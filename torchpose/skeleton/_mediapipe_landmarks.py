@@ -16,8 +16,6 @@ from torchpose._core.checks import check_shape
 from torchpose.errors import SkeletonError
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = ["DERIVED_JOINTS", "LANDMARKS", "count_given", "derive_joints", "lacks_joints"]
-
 LANDMARKS = (
     "nose",
     "left_eye_inner", "left_eye", "left_eye_outer",

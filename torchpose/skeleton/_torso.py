@@ -17,20 +17,6 @@ from torchpose.errors import PriorError
 from torchpose.math._rotations import procrustes
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = [
-    "ALIGN_JOINTS",
-    "KINECT_NECK",
-    "TORSO",
-    "NeckFraction",
-    "NeckOffset",
-    "in_torso_axes",
-    "learn_neck_fraction",
-    "learn_neck_offset",
-    "onto_torso",
-    "place_neck",
-    "upright_axes",
-]
-
 ALIGN_JOINTS = (3, 4, 2, 5)
 """Head, neck and both shoulders of the 8-joint upper body: what the paper aligns (BL section 6)."""
 

@@ -27,23 +27,6 @@ from torchpose.skeleton._joint_sets import (
     identify_skeleton,
 )
 
-__all__ = [
-    "ARM_JOINTS",
-    "BONES",
-    "LEFT_ARM",
-    "LIMBS",
-    "NECK_KINDS",
-    "OTHER_SIDE",
-    "RIGHT_ARM",
-    "UpperBody",
-    "UpperBodyMap",
-    "measure_neck_kind",
-    "mirror_pose",
-    "scale_bones",
-    "to_upper_body",
-    "upper_body_indices",
-]
-
 ARM_JOINTS = ("hand", "elbow", "shoulder", "head", "neck")
 """The five joints of one arm's state, in its order."""
 

@@ -13,8 +13,6 @@ from torchpose.errors import InputError
 from torchpose.math._half_planes import log_outside
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["HANDS", "Absence", "absence_of", "log_beyond"]
-
 HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
 """Rows of the hands among the eight joints."""
 

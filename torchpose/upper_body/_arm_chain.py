@@ -19,8 +19,6 @@ from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, sphere_points
 from torchpose.upper_body._torso_occlusion import log_in_view
 
-__all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity", "mirrored"]
-
 _ANGLES = 17  # of a bone whose end is measured
 _AROUND = 150  # directions of one whose end is not
 _BOTH = 68  # of each of two such bones

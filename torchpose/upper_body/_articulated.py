@@ -49,8 +49,6 @@ from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._root_grid import Moments, RootGrid
 from torchpose.upper_body._torso_likelihood import Root
 
-__all__ = ["ArticulatedFilter", "ArticulatedState"]
-
 _SHARE = 0.2  # seconds over which frames say the same about lengths
 _SHARE_OF_TORSO = 0.6  # the same about the torso
 _UPDATE = 0.1  # seconds from one update of the torso to the next

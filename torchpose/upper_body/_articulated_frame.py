@@ -14,21 +14,6 @@ from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._torso_likelihood import NOT_RAISED, REACH, STIFF_SHOULDER, Torso
 
-__all__ = [
-    "ELBOWS",
-    "HANDS",
-    "SHOULDERS",
-    "Facts",
-    "RayFrame",
-    "UprightFrame",
-    "as_rays",
-    "facts_of",
-    "split",
-    "together",
-    "upright",
-    "with_middle",
-]
-
 _NECK = UPPER_BODY.index("neck")
 SHOULDERS, ELBOWS, HANDS = (
     [UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right")]

@@ -19,14 +19,6 @@ from torchpose.upper_body._arm_chain import ArmChain, ArmState, mirrored
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
 from torchpose.upper_body._estimator import Bones, Estimates, ReadOut
 
-__all__ = [
-    "FramePose",
-    "SeenBody",
-    "bones_of",
-    "estimates_of",
-    "pose_of",
-]
-
 _NECK = UPPER_BODY.index("neck")
 _STD = 0.03  # metres: of every joint in space
 # Factors on the covariances of arms that are seen whole, and of those of which the hand is seen alone, at

@@ -20,8 +20,6 @@ from torchpose.upper_body._face_points import face_evidence
 from torchpose.upper_body._root_grid import RootGrid
 from torchpose.upper_body._torso_likelihood import Root, Torso, middle_of_shoulders
 
-__all__ = ["RootStep", "Roots", "covs_of_roots"]
-
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
 _SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones

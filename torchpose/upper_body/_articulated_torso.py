@@ -18,8 +18,6 @@ from torchpose.upper_body._torso_likelihood import (
     spine_places,
 )
 
-__all__ = ["shoulder_places", "torso_joints"]
-
 _SPINE = [UPPER_BODY.index("neck"), UPPER_BODY.index("head")]
 
 

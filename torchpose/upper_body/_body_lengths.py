@@ -23,8 +23,6 @@ from torchpose.upper_body._torso_likelihood import (
     inward_shares,
 )
 
-__all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths", "Sizes"]
-
 BODY_LENGTHS = ("upper_arm", "forearm", "shoulder_width", "head_height")
 """Lengths that may be given: shoulder to elbow, elbow to the measured hand or wrist, between the
 shoulders, and from Kinect's neck, 10.5 cm above the middle of the shoulders, up to the head, whatever neck

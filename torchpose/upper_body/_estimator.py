@@ -18,28 +18,6 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
 from torchpose.upper_body._measured_joints import MeasuredJoints
 
-__all__ = [
-    "ARMS",
-    "ArmGenerators",
-    "ArmJoints",
-    "Bones",
-    "Estimates",
-    "Estimator",
-    "MotionRatios",
-    "ReadOut",
-    "TrackerModel",
-    "arm_joints",
-    "check_model",
-    "first_failure",
-    "generators_of_arms",
-    "in_double",
-    "joints_of_arm",
-    "mending_notes",
-    "repeat_last",
-    "repeat_reading",
-    "require_cov",
-]
-
 ArmJoints = dict[str, tuple[str, ...]]
 """For each arm, "left" and "right", those of `ARM_JOINTS` that are measured."""
 

@@ -24,24 +24,6 @@ from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
 from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture
 
-__all__ = [
-    "BONES",
-    "METHODS",
-    "SINGLE_POSES",
-    "WINDOWS",
-    "Chosen",
-    "Method",
-    "check_options",
-    "check_steady",
-    "choose_method",
-    "method_options",
-    "noise_options",
-    "options_of_window",
-    "process_cov",
-    "register_method",
-    "replace_window",
-]
-
 WINDOWS = "window-mixture"
 """The mixture over short windows of motion, in each of which every frame is estimated anew."""
 

@@ -13,8 +13,6 @@ from torch import Tensor
 from torchpose.math._rotations import within_half_turn
 from torchpose.upper_body._torso_likelihood import heavy_tail
 
-__all__ = ["FACE", "FacePoints", "face_evidence", "head_in_face", "measure_face"]
-
 FACE = ("nose", "eye_left", "eye_right", "ear_left", "ear_right")
 """Keypoints that tell where a head faces."""
 

@@ -30,19 +30,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import onto_torso
 from torchpose.upper_body._estimator import Estimates, MotionRatios, ReadOut, require_cov
 
-__all__ = [
-    "MotionStage",
-    "MotionStageState",
-    "calibration_mode",
-    "in_camera_axes",
-    "kept_stage",
-    "on_their_rays",
-    "read_out",
-    "recalibrated",
-    "stage_lag",
-    "turned",
-]
-
 _LIMB_ENDS = tuple(
     UPPER_BODY.index(f"{j}_{s}") for j in ("hand", "elbow") for s in ("left", "right")
 )

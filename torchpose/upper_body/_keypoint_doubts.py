@@ -8,8 +8,6 @@ from torchpose.errors import CameraError
 from torchpose.io._keypoints import Keypoints, said_of_crowd
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = ["doubts_about", "refuse_another_size"]
-
 _UPPER = ("head", "nose", "neck")
 _LOWER = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right", "hip_left", "hip_right")
 _TURNED = 0.8  # share of the frames in which what is above should not be below

@@ -22,8 +22,6 @@ from torchpose.upper_body._keypoint_doubts import doubts_about, refuse_another_s
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
-__all__ = ["KeypointFileTracker", "PreparedTracker", "TrackSettings"]
-
 _KEPT_TRACKERS = 8
 
 

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["lean_angle", "roll", "seen_lean"]
-
 _LEFT, _RIGHT = (UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right"))
 _MEMORY = 0.5  # seconds
 _LEVEL = math.radians(15.0)  # shoulders that are raised look like a lean of that much

@@ -13,8 +13,6 @@ from torch.nn.functional import normalize
 
 from torchpose._core.module_state import outside_inference
 
-__all__ = ["LimbNodes", "nodes_anywhere", "nodes_on_ray", "sphere_points"]
-
 _STEEPEST = 80.0  # degrees out of the image plane; beyond, a limb is a point in the image
 
 

@@ -12,15 +12,6 @@ from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._screen_tracks import ScreenState
 
-__all__ = [
-    "LivePose",
-    "StreamState",
-    "check_stream",
-    "check_stream_method",
-    "live_pose",
-    "unseen_frames",
-]
-
 
 class StreamState(NamedTuple):
     """State of `UpperBodyTracker.step` between two frames.

@@ -22,24 +22,6 @@ from torchpose.upper_body._face_points import FacePoints, measure_face
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
 
-__all__ = [
-    "MeasuredJoints",
-    "arm_measurements",
-    "as_lengths",
-    "block_diagonal",
-    "check_gaps",
-    "check_sequences",
-    "in_prior_pixels",
-    "joint_covariances",
-    "kept_pixel_maps",
-    "known_covariances",
-    "measure_joints",
-    "measured_keypoints",
-    "pixel_indices",
-    "pixels_per_metre",
-    "place_measured_neck",
-]
-
 _DEFAULT_STD = 3.0  # pixels
 _LEAST_CONFIDENCE = 0.05
 # Metres of the neck above the middle of the shoulders where there is no head, and their spread.

@@ -45,8 +45,6 @@ from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
-__all__ = ["MultipleModelFilter", "MultipleModelState"]
-
 _LIMBS = [*ELBOWS, *HANDS]
 _MEMORY = 4.0  # seconds after which evidence counts for 1/e
 _SHARE = 0.5  # of the mean evidence of a frame that counts: frames are alike, so many are as few

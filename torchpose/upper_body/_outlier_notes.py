@@ -8,8 +8,6 @@ from torch import Tensor, arange
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["exchanged_frames", "outlier_notes", "without_outliers"]
-
 _TAKEN, _EXCHANGED = "taken as outliers, as if missing", "left and right exchanged back in"
 
 

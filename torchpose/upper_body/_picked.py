@@ -9,8 +9,6 @@ from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.skeleton._upper_body import upper_body_indices
 from torchpose.upper_body._face_points import FACE
 
-__all__ = ["Picked", "pick_joints"]
-
 _NECK = UPPER_BODY.index("neck")
 _WRISTS = "wrists are measured in place of hands: hand_left and hand_right are the wrists"
 _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")

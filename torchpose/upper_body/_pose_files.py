@@ -16,8 +16,6 @@ from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._pose_track import PoseTrack
 
-__all__ = ["BvhMotion", "joints_to_bvh", "write_bvh", "write_pose_csv"]
-
 _FPS = 30.0
 _TO_Y_UP = (1.0, -1.0, -1.0)  # camera axes to x left, y up, z forward, for one who faces the camera
 _CENTIMETRES = 100.0

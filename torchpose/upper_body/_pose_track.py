@@ -15,8 +15,6 @@ from torchpose.camera._projection import check_intrinsics
 from torchpose.errors import CameraError, FileFormatError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["BONE_NAMES", "FRAME_FIELDS", "PoseTrack"]
-
 BONE_NAMES = ("upper_arm", "forearm_to_hand", "shoulder_width", "head_height")
 """Lengths of bones in the order of `PoseTrack.bone_lengths`, unless it has forearms to the wrist."""
 

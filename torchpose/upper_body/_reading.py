@@ -35,8 +35,6 @@ from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._screening import Screened
 
-__all__ = ["PoseReader", "check_frame", "note_collapse"]
-
 
 class PoseReader(NamedTuple):
     """Reader of poses out of the estimates of both arms.

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from torchpose.upper_body._torso_likelihood import Root, Torso, TorsoLengths, torso_log_likelihood
 
-__all__ = ["Moments", "RootGrid"]
-
 # Metres, as the Kinect recordings have it, and of its log: others sit at webcams, or stand in halls.
 _DEPTH, _DEPTH_STD = 2.6, 0.6
 _NEAREST, _FARTHEST, _DEPTH_STEP = 0.4, 9.0, 0.04  # metres, and the step of log depth

@@ -16,18 +16,6 @@ from torchpose.skeleton._upper_body import OTHER_SIDE
 from torchpose.upper_body._measured_joints import pixels_per_metre
 from torchpose.upper_body._picked import Picked
 
-__all__ = [
-    "APART",
-    "BRISK",
-    "CERTAIN",
-    "OUTLIERS",
-    "SLACK",
-    "TAKEOVER",
-    "ScreenModel",
-    "kept_screen_model",
-    "screen_model",
-]
-
 
 class _Kind(NamedTuple):
     """Place and motion of joints of one kind.

@@ -9,18 +9,6 @@ from torch import Tensor
 
 from torchpose.upper_body._screen_model import CERTAIN, TAKEOVER, ScreenModel
 
-__all__ = [
-    "DOUBTFUL",
-    "TRACKS",
-    "ScreenState",
-    "in_order",
-    "init_screen",
-    "predict_tracks",
-    "start_candidates",
-    "take_over",
-    "update_tracks",
-]
-
 TRACKS = ("position", "velocity", "cov", "evidence")
 """Fields of `ScreenState` that hold a track and a candidate of each joint."""
 

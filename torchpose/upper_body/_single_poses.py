@@ -32,15 +32,6 @@ from torchpose.upper_body._estimator import (
 )
 from torchpose.upper_body._measured_joints import MeasuredJoints, arm_measurements, pixel_indices
 
-__all__ = [
-    "PoseFilter",
-    "PoseState",
-    "ProcessNoise",
-    "SinglePoses",
-    "default_process_cov",
-    "default_walk_cov",
-]
-
 _WALK_RATE = 0.9  # of a component's covariance, per second; chosen as the methods' factors were
 
 

@@ -11,25 +11,6 @@ from torch import Tensor
 
 from torchpose._core.module_state import outside_inference
 
-__all__ = [
-    "NECK_HEIGHT",
-    "NOT_RAISED",
-    "REACH",
-    "STIFF_SHOULDER",
-    "Root",
-    "Torso",
-    "TorsoLengths",
-    "half_widths",
-    "heavy_tail",
-    "inward_shares",
-    "middle_of_shoulders",
-    "shoulder_offsets",
-    "spine_places",
-    "torso_log_likelihood",
-    "torso_places",
-    "with_axes",
-]
-
 NECK_HEIGHT = 0.105
 """Metres of Kinect's neck above the middle of the shoulders."""
 

@@ -6,8 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["log_in_view"]
-
 _WIDE, _DEEP = 0.45, 0.25  # half the width and depth of a torso, in widths of the shoulders
 _TOP, _BOTTOM = 0.15, 1.5  # where it begins and ends, below the shoulders, in the same
 _SOFT, _SOFT_TOP, _SOFT_BOTTOM = 0.15, 0.05, 0.1  # of its surface, in half depths; of its ends

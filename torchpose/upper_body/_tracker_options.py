@@ -10,8 +10,6 @@ from torch import Tensor
 from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._pose_track import PoseTrack
 
-__all__ = ["MethodOptions", "TrackerOptions"]
-
 
 class MethodOptions(TypedDict, total=False):
     """The options of all shipped methods; `method_options` tells which of them a method has.

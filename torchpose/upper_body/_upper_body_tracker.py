@@ -66,8 +66,6 @@ from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model
 from torchpose.upper_body._screening import screen_joints
 from torchpose.upper_body._tracker_options import MethodOptions
 
-__all__ = ["UpperBodyTracker"]
-
 _NO_EXPORT = (
     "UpperBodyTracker, which chooses its filters by what was measured,",
     "a step of a filter of torchpose.filters",

@@ -23,8 +23,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator import ARMS
 from torchpose.upper_body._measured_joints import MeasuredJoints, pixels_per_metre
 
-__all__ = ["SeenInView", "see_in_view", "suitable_window"]
-
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 

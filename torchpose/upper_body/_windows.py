@@ -43,8 +43,6 @@ from torchpose.upper_body._measured_joints import (
 )
 from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
 
-__all__ = ["WindowMixture", "WindowState"]
-
 _N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
 _LIMBS = ARM_JOINTS[:_N_LIMB]
 

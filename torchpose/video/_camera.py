@@ -10,8 +10,6 @@ from torchpose._core.checks import check_rate
 from torchpose.errors import FileFormatError, InputError
 from torchpose.video._source_interface import VideoFrame, VideoSource
 
-__all__ = ["CameraSource", "Capture"]
-
 _WARM_UP = 10  # frames that are discarded: exposure settles, and the rate is measured
 _PATIENCE = 5  # reads without a frame, one after another, before a camera counts as unplugged
 _PAUSE = 0.02  # seconds between them

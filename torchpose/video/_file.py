@@ -26,8 +26,6 @@ from torchpose.video._timing import (
 if TYPE_CHECKING:
     import av
 
-__all__ = ["FileSource"]
-
 _FALLBACK_FPS = 30.0
 _FASTEST = 1000.0  # frames per second; higher rates are no valid times
 _MOST_HELD = 64  # frames in a decoder's pipeline that fail one after another

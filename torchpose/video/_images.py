@@ -13,8 +13,6 @@ from torchpose._core.images import Image
 from torchpose.errors import FileFormatError, InputError
 from torchpose.video._source_interface import VideoFrame, VideoSource
 
-__all__ = ["FolderSource", "find_images", "natural_key"]
-
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 _DEFAULT_FPS = 30.0
 

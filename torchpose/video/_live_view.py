@@ -14,8 +14,6 @@ from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
 from torchpose.errors import InputError, OutputError
 
-__all__ = ["LiveView"]
-
 _HOST = "127.0.0.1"  # this machine only, since it shows a camera
 _BOUNDARY = "torchpose-frame"
 _PATIENCE = 1.0  # seconds after which a waiting browser gets the last picture again

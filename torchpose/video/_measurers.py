@@ -22,16 +22,6 @@ from torchpose.measure._upper_body_measurer import (
     UpperBodyMeasurer,
 )
 
-__all__ = [
-    "Found",
-    "MeasuredBlock",
-    "Measurer",
-    "SeenFrame",
-    "look_ahead",
-    "measure_blocks",
-    "measurer_of",
-]
-
 Found = FrameMeasurements | FrameKeypoints
 """The measurements of all persons in a frame."""
 

@@ -24,8 +24,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS
 from torchpose.viz._style import LEFT, RIGHT, side_of
 
-__all__ = ["PERSON_TINTS", "Color", "Pen", "draw_body", "draw_overlay", "rgb"]
-
 Color = tuple[int, int, int]
 
 PERSON_TINTS = ("#F2F2F2", "#009E73", "#CC79A7", "#F0E442", "#56B4E9")

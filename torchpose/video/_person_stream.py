@@ -19,17 +19,6 @@ from torchpose.upper_body._live_pose import StreamState
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
-__all__ = [
-    "Measured",
-    "PersonStream",
-    "PersonStreamState",
-    "TrackedBlock",
-    "absent_for",
-    "measured_of",
-    "unmeasured",
-    "without_long_gaps",
-]
-
 
 class Measured(NamedTuple):
     """Holds the measurements of one person in T frames.

@@ -7,8 +7,6 @@ from typing import Any, Generic, TypeVar
 
 from torchpose._core.checks import check_count
 
-__all__ = ["prefetch"]
-
 T = TypeVar("T")
 
 

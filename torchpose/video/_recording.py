@@ -30,8 +30,6 @@ from torchpose.video._person_stream import (
     without_long_gaps,
 )
 
-__all__ = ["PoseSpool", "TrackedPerson", "TrackedRecording", "smoothed"]
-
 _LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
 
 

@@ -21,16 +21,6 @@ from torchpose.errors import CameraError, InputError
 from torchpose.measure._brightness_background import BrightnessBackground, PixelKind
 from torchpose.video._source_interface import VideoFrame, VideoSource
 
-__all__ = [
-    "SilhouetteMeasurer",
-    "SilhouetteView",
-    "clean_silhouette",
-    "fit_view",
-    "fit_views",
-    "frames_in_step",
-    "read_silhouettes",
-]
-
 _PART = 0.03  # of the largest piece: smaller ones are no part of the person
 _HOLE = 0.02  # of the silhouette: larger holes are real, such as between arm and body
 _STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, of a static pixel

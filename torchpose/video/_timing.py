@@ -16,18 +16,6 @@ from torchpose.errors import FileFormatError, InputError
 if TYPE_CHECKING:
     import av
 
-__all__ = [
-    "Rate",
-    "Scan",
-    "Tally",
-    "frame_rate",
-    "is_cover",
-    "open_container",
-    "scan_packets",
-    "shown_for",
-    "to_constant_rate",
-]
-
 T = TypeVar("T")
 _JITTER = 0.2  # of the usual interval: what a constant rate may deviate by
 _REGULAR = 0.9  # of all intervals have to be that regular

@@ -12,8 +12,6 @@ from torchpose._core.files import atomic_path
 from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
 
-__all__ = ["VideoWriter"]
-
 _ENCODERS = ("libx264", "libopenh264")
 _PRESETS = [
     "ultrafast",

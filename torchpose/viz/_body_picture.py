@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 else:
     Figure = Any
 
-__all__ = ["plot_body_strip"]
-
 _VIEWS = {"camera": (0, 1), "side": (2, 1)}
 
 

@@ -38,14 +38,6 @@ if TYPE_CHECKING:
 else:
     Figure = Any
 
-__all__ = [
-    "plot_error_bars",
-    "plot_errors_over_time",
-    "plot_joint_curves",
-    "plot_pcp",
-    "plot_reliability",
-]
-
 CURVE_JOINTS = ("hand_left", "elbow_left", "hand_right", "elbow_right")
 ERROR_JOINTS = ("hand_left", "hand_right", "elbow_left", "elbow_right", "shoulder_left",
                 "shoulder_right")  # fmt: skip

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = ActionSpace = BackConstrainedGPLVM = Body = Synchronised = Any
 
-__all__ = ["plot_action_space", "plot_manifold"]
-
 _MARGIN, _ARROWS = 0.18, 5
 _SIDE, _UP = 2, 1  # part axes: z forward, y up
 

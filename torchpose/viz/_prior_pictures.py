@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = SubFigure = UpperBodyPrior = Any
 
-__all__ = ["plot_log_likelihood", "plot_prior_components", "plot_prior_samples"]
-
 _FRONT, _SIDE = (0, 1), (2, 1)
 _VIEWS = {"front": _FRONT, "side": _SIDE}
 _PER_ROW, _PANEL = 6, 1.9  # panels and their width in inches

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = Any
 
-__all__ = ["plot_rotations"]
-
 _WIDTH, _COLUMNS = 3.3, 4
 _STEPS = 24  # of an arc from the mean to a sigma point
 

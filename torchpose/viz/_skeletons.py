@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = Any
 
-__all__ = ["draw_skeleton", "plot_pose", "plot_pose_3d", "plot_pose_strip", "plot_prior_means"]
-
 ARM_LIMBS = ((0, 1), (1, 2), (2, 4), (4, 3))
 """Lines of the five joints of an arm's state: hand, elbow, shoulder, head, neck."""
 

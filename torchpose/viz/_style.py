@@ -17,33 +17,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = Any
 
-__all__ = [
-    "INK",
-    "LARGE",
-    "LEFT",
-    "MIDDLE",
-    "MUTED",
-    "NORMAL",
-    "PALE",
-    "RIGHT",
-    "SIDE_COLORS",
-    "SMALL",
-    "add_legend",
-    "join_unit",
-    "joint_colors",
-    "label_row",
-    "legend_line",
-    "method_styles",
-    "new_figure",
-    "readable",
-    "require_matplotlib",
-    "save_figure",
-    "side_of",
-    "style_axes",
-    "to_numpy",
-    "weight_bar",
-]
-
 INK, MUTED, PALE, GRID = "#222222", "#666666", "#B8B8B8", "#E4E4E4"
 LEFT, RIGHT, MIDDLE = "#0072B2", "#D55E00", "#555555"
 SIDE_COLORS = {"left": LEFT, "right": RIGHT, "middle": MIDDLE}

@@ -14,8 +14,6 @@ from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
 from torchpose.io._c3d_file import write_c3d
 from torchpose.io._trc_file import write_trc
 
-__all__ = ["BODY_FORMATS", "UP_AXES", "BodyMotion3d", "marker_names", "write_body_file"]
-
 BODY_FORMATS = ("trc", "c3d", "bvh")
 UP_AXES = ("z", "y")
 _CENTIMETRES = 100.0

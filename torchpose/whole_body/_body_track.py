@@ -20,8 +20,6 @@ from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonEr
 from torchpose.whole_body._body_files import BodyMotion3d, write_body_file
 from torchpose.whole_body._filters.body_particles import first_true
 
-__all__ = ["BodyTrack", "load_body", "repeat_last"]
-
 _FRAMES = {
     "state": "f T 36",
     "state_std": "f T 36",

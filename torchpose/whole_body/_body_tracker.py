@@ -49,8 +49,6 @@ from torchpose.whole_body._keypoints.people_tracker import PeopleStream
 from torchpose.whole_body._measured_keypoints import given_keypoints
 from torchpose.whole_body._particle_follower import ParticleFollower
 
-__all__ = ["BodyStream", "BodyTracker"]
-
 _HEIGHT = 1.75  # metres, of a person of unknown height
 
 

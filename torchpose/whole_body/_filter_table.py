@@ -27,20 +27,6 @@ from torchpose.whole_body._filters.root_uncertainty import RootUncertaintyTracke
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._filters.sir import SIRParticleFilter
 
-__all__ = [
-    "LEARNT",
-    "METHODS",
-    "BodyMethod",
-    "BodyTrackerOptions",
-    "LearntKind",
-    "check_options",
-    "choose_method",
-    "make_filter",
-    "method_options",
-    "rebased",
-    "register_body_filter",
-]
-
 _DEFAULT = "apf"  # needs nothing
 _DEPRECATED = {"step_std"}  # options that still work and are not listed
 

@@ -19,8 +19,6 @@ from torchpose.whole_body._filters.body_frames import is_seen, silhouette_score
 from torchpose.whole_body._filters.motion import default_step_std
 from torchpose.whole_body._pose_search import find_candidates, world_up
 
-__all__ = ["FirstPose", "facing_evidence", "find_first_pose", "turned_round"]
-
 _LAYERS = 5  # of the annealed filter that tracks the candidates
 _LEAST = 4 * _LAYERS  # likelihoods of a frame: two of a layer's particles survive
 _RATE = 60.0  # frames per second for which `default_step_std` is

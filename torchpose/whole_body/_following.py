@@ -19,8 +19,6 @@ from torchpose.whole_body._filters.body_particles import BodyFilterState, stack_
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 
-__all__ = ["Observed", "all_see", "follow", "track_body"]
-
 _SEEN = 0.002  # of the image: fewer pixels are nobody
 
 

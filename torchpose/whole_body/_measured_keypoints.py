@@ -18,8 +18,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS
 from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 
-__all__ = ["BodyKeypointMeasurer", "GivenKeypoints", "given_keypoints", "observed_frames"]
-
 
 class GivenKeypoints(NamedTuple):
     """Holds keypoints as `BodyTracker` takes them, for T frames."""

@@ -24,8 +24,6 @@ from torchpose.whole_body._measured_keypoints import (
     observed_frames,
 )
 
-__all__ = ["ParticleFollower"]
-
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 
 

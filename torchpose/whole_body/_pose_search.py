@@ -27,16 +27,6 @@ from torchpose.whole_body._filters.annealed import anneal
 from torchpose.whole_body._filters.body_frames import silhouette_score
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 
-__all__ = [
-    "PoseCandidates",
-    "SilhouettePlace",
-    "find_candidates",
-    "find_pose",
-    "place_from_silhouettes",
-    "upward_direction",
-    "world_up",
-]
-
 _ACROSS = 0.1  # metres: how far the middle of a silhouette lies from that of the body
 _DEPTH_SHARE = 0.1  # of a ray's information across it that its length has, from the person's height
 _TILT = 0.1  # sine of half the angle by which a trunk leans, about each axis

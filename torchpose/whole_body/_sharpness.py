@@ -12,8 +12,6 @@ from tqdm.auto import tqdm
 from torchpose.errors import InputError
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
-__all__ = ["SharpnessFit", "ValidationSequence", "fit_sharpness", "log_grid", "mean_joint_error"]
-
 
 class ValidationSequence(NamedTuple):
     """Silhouettes of a known motion.

@@ -19,8 +19,6 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.io._mocap import MocapClip
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = ["TrueShape", "limb_kinds", "true_limbs"]
-
 _SIDES = ("left", "right")
 _LEG = 0.84
 """Length of thigh and shank, metres, of the person whose radii the tables below hold."""

@@ -15,17 +15,6 @@ from torchpose._core.images import Image
 from torchpose.demo._rendering.paint import Array, Capsule, Sprite, paint_capsule
 from torchpose.errors import InputError, MissingDependencyError
 
-__all__ = [
-    "FACE_BOX",
-    "LOOKS",
-    "TORSO_TEXTURE",
-    "Look",
-    "Portrait",
-    "Wardrobe",
-    "load_portrait",
-    "wardrobe",
-]
-
 Colour = tuple[float, float, float]
 
 # Left, top (metres on the torso, from the neck) and pixels per metre of the torso's texture.

@@ -6,18 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "LIGHT",
-    "Array",
-    "Box",
-    "Capsule",
-    "Sprite",
-    "paint_capsule",
-    "paint_polygon",
-    "paint_sprite",
-    "polygon_box",
-]
-
 Array = NDArray[np.float32]
 
 LIGHT = (-0.38, -0.52, 0.765)

@@ -26,8 +26,6 @@ from torchpose.demo._rendering.paint import (
 )
 from torchpose.math._rotations import euler_to_matrix
 
-__all__ = ["FACE_FROM_HEAD", "Bodies", "Part", "Pose", "bodies", "body_parts"]
-
 Points = NDArray[np.float64]
 
 FACE_FROM_HEAD = (0.0, 0.025, -0.04)

@@ -11,8 +11,6 @@ from torchpose.demo._rendering.look import smooth_noise
 from torchpose.demo._rendering.paint import Array
 from torchpose.errors import InputError
 
-__all__ = ["Scene", "Sensor", "room"]
-
 
 @dataclass(frozen=True)
 class Scene:

@@ -28,17 +28,6 @@ from torchpose.demo._rendering.paint import Array, Capsule, paint_capsule
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip
 
-__all__ = [
-    "AZIMUTHS",
-    "Walk",
-    "cameras_around",
-    "empty_scene",
-    "gait_angles",
-    "render_body_video",
-    "walk",
-    "walk_clip",
-]
-
 # Flexion in degrees at shares of the cycle from one heel strike to the next of the same foot, after the
 # normal curves in textbooks of gait analysis (loading, mid stance, push-off, swing). Knees are 8 degrees
 # more bent: between joints of motion capture they are never quite straight.

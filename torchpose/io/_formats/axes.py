@@ -13,19 +13,6 @@ from torch import Tensor
 from torchpose.errors import FileFormatError, InputError
 from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 
-__all__ = [
-    "AXES",
-    "METRES_PER",
-    "Axes",
-    "Unit",
-    "axes_rotation",
-    "body_unit",
-    "check_upright",
-    "default_axes",
-    "heading",
-    "unit_from_text",
-]
-
 Axes = Literal["camera", "kinect", "y-up", "z-up"]
 AXES: tuple[str, ...] = get_args(Axes)
 

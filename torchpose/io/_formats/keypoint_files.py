@@ -19,8 +19,6 @@ from torchpose._core.reading import (
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
 
-__all__ = ["RawKeypoints", "read_csv_keypoints", "read_npz_keypoints"]
-
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 
 

@@ -18,15 +18,6 @@ from torchpose.io._formats.raw_recording import (
 )
 from torchpose.skeleton._joint_sets import SKELETONS, canonical_name
 
-__all__ = [
-    "ROW_LENGTHS",
-    "dropped_frames",
-    "frame_rate",
-    "header_joints",
-    "read_kinect_csv",
-    "split_row",
-]
-
 KINECT_FPS = 30.0
 _KINECT_TICK = 1e-7  # Kinect v2's time stamps count 100 ns
 _TICKS = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", _KINECT_TICK: "100 ns"}

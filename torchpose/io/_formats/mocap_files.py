@@ -13,8 +13,6 @@ from torchpose.io._formats.axes import unit_from_text
 from torchpose.io._formats.raw_recording import RawRecording
 from torchpose.skeleton._joint_sets import canonical_name
 
-__all__ = ["C3DPoints", "bvh_joint_names", "read_bvh", "read_c3d", "read_c3d_points"]
-
 # Words of a node for each joint. Many files call the shoulder joint "arm" and put a node "shoulder"
 # at the collar; there the node "hand" stands in the wrist.
 _ARM_WORDS = ("arm", "uparm", "upperarm", "shldr")

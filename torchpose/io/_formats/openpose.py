@@ -17,8 +17,6 @@ from torchpose._core.reading import check_span, read_json, reading
 from torchpose.errors import FileFormatError, InputError
 from torchpose.skeleton._joint_sets import SKELETONS
 
-__all__ = ["OpenPosePeople", "OpenPosePerson", "read_openpose", "read_openpose_people"]
-
 _SUFFIX = "_keypoints.json"
 _LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
 _BODY_25B = (

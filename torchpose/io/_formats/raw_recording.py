@@ -20,17 +20,6 @@ from torchpose._core.reading import (
 from torchpose.errors import FileFormatError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = [
-    "SENSOR_WEIGHTS",
-    "BodyFrame",
-    "RawRecording",
-    "frame_ranges",
-    "join_bodies",
-    "numbers",
-    "read_npz_recording",
-    "read_opencv_recording",
-]
-
 SENSOR_WEIGHTS = (0.0, 0.5, 1.0)
 """Kinect's tracking states as weights: not tracked, inferred, tracked."""
 

@@ -12,8 +12,6 @@ from torchpose.io._formats.kinect_csv import KINECT_FPS, dropped_frames, read_ki
 from torchpose.io._formats.raw_recording import SENSOR_WEIGHTS, BodyFrame, RawRecording, join_bodies
 from torchpose.skeleton._joint_sets import SKELETONS
 
-__all__ = ["read_azure_json", "read_kinect_v1", "read_ntu_skeleton"]
-
 _KINECT_V1_NAMES = SKELETONS["kinect-v1-20"].joints
 _ROWS_PER_BODY = 2 * len(_KINECT_V1_NAMES)  # each joint in metres, then in pixels
 

@@ -18,19 +18,6 @@ from torchpose.learning._training import MIRROR
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._upper_body import BONES, scale_bones
 
-__all__ = [
-    "BONE_RATIOS",
-    "PersonBones",
-    "bone_lengths",
-    "face_camera",
-    "find_wrong_joints",
-    "harmonise_bones",
-    "human_size",
-    "mirrored",
-    "person_bones",
-    "torso_rotation",
-]
-
 BONE_RATIOS = (1.75, 2.5, 1.75, 1.75, 2.5, 1.75, 1.75)
 """How many times its usual length a bone may have, or the inverse, in the order of `BONES`. A neck
 comes nearer to its shoulders when they are shrugged, so those bones may vary more."""

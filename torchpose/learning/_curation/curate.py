@@ -36,8 +36,6 @@ from torchpose.learning._curation.splits import (
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = ["Curated", "CurationSettings", "curate"]
-
 _RATE = 30.0  # of recordings that do not say: a Kinect's
 _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")
 

@@ -12,16 +12,6 @@ from torchpose.io._recordings import Recording
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import upper_body_indices
 
-__all__ = [
-    "JUMP_SPEEDS",
-    "find_jumps",
-    "label",
-    "measured",
-    "runs",
-    "with_missing",
-    "with_upper_joints",
-]
-
 
 def label(recording: Recording) -> str:
     """Return the file of a recording, for messages."""

@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 
 from torchpose.io._formats.raw_recording import frame_ranges
 
-__all__ = ["CurationReport", "Drop", "Size"]
-
 _SHOWN_NOTES = 20
 
 

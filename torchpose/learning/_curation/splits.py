@@ -13,23 +13,6 @@ from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import label, measured
 from torchpose.learning._training import one_kind
 
-__all__ = [
-    "Duplicate",
-    "PersonSplit",
-    "check_kinds",
-    "describe_duplicate",
-    "find_duplicates",
-    "leave_one_person_out",
-    "persons_of",
-    "pick_persons",
-    "refuse_leaks",
-    "refuse_shared_between_persons",
-    "refuse_shared_recordings",
-    "same_names",
-    "skeleton_counts",
-    "split_persons",
-]
-
 _GRID = 0.02  # metres: coarse, so that copies in whole millimetres mostly agree on it
 _SHARED = 0.5  # of the shorter recording's frames
 _MOST_COPIES = 64  # of one frame that are compared

@@ -17,19 +17,6 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 from torchpose.upper_body._estimator import ARMS
 
-__all__ = [
-    "MEASURED",
-    "Fraction",
-    "Positive",
-    "TunableMixture",
-    "arm_in_body_axes",
-    "departure_of",
-    "parameter_groups",
-    "pose_error",
-    "tuned_info",
-    "tuned_mixtures",
-]
-
 MEASURED = ("hand", "head", "neck")
 _MIXTURE_RATE = 0.04
 _SMOOTH = 1e-3  # metres: distances below it count as squares, so that they have a gradient

@@ -32,8 +32,6 @@ from torchpose.upper_body._estimator import ARMS
 from torchpose.upper_body._estimator_table import noise_options
 from torchpose.upper_body._measured_joints import pixel_indices
 
-__all__ = ["SequenceBatch", "TunableKalman", "draw_sequences"]
-
 _ROWS = [ARM_JOINTS.index(joint) for joint in MEASURED]
 
 

@@ -30,8 +30,6 @@ from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import ARMS
 from torchpose.upper_body._measured_joints import joint_covariances, pixel_indices
 
-__all__ = ["TunableWindow", "WindowBatch", "draw_windows"]
-
 
 class WindowBatch(NamedTuple):
     """Windows of both arms, of the same bodies from the same viewpoints.

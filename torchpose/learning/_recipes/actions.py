@@ -37,8 +37,6 @@ from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.priors._actions.space import ActionSpace
 
-__all__ = ["COMMON_HEIGHT", "ActionRecipe", "FittedActions", "Performances", "fit_actions"]
-
 COMMON_HEIGHT = 1.75
 """Height in metres of the body that everybody's postures are transferred to."""
 

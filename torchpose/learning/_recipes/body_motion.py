@@ -35,8 +35,6 @@ from torchpose.math._rotations import matrix_to_quaternion_vector
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = ["MotionSpread", "RecordedMotion", "fit_motion", "motion_summary"]
-
 
 @dataclass(frozen=True)
 class RecordedMotion:

@@ -18,16 +18,6 @@ from torchpose.upper_body._fusion import calibration_mode
 from torchpose.upper_body._single_poses import PoseFilter
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
-__all__ = [
-    "DRAWN",
-    "MODES",
-    "HeldOut",
-    "calibration_noise",
-    "fit_calibration",
-    "folds",
-    "track_held_out",
-]
-
 MODES: dict[str, dict[str, Any]] = {
     "pose": {"method": "mkf-fixed"},
     "causal": {"method": "window-mixture"},

@@ -21,18 +21,6 @@ from torchpose.io._mocap import resample_frames
 from torchpose.io._recordings import Recording, find_recordings, read_recordings
 from torchpose.learning._curation.splits import pick_persons, refuse_shared_recordings
 
-__all__ = [
-    "ChosenRecordings",
-    "body_of_each",
-    "choose_recordings",
-    "expand_path",
-    "fingerprint",
-    "origin_of",
-    "recorded_joints",
-    "recording_name",
-    "state_of",
-]
-
 
 class ChosenRecordings(NamedTuple):
     """Holds the recordings to fit to, and those of held-out persons, each in the order of the files."""

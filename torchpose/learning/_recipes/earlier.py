@@ -12,8 +12,6 @@ from torchpose.learning._training import RecordingLike
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout
 
-__all__ = ["fit_recipe_2", "renew_noise"]
-
 
 def fit_recipe_2(
     recordings: Sequence[RecordingLike], **settings: Unpack[RecipeSettings]

@@ -33,8 +33,6 @@ from torchpose.learning._recipes.choosing import (
 from torchpose.math._rotations import compose, conjugate
 from torchpose.priors._limb_conditionals import LimbConditionals
 
-__all__ = ["LimbSpread", "LimbStates", "check_least_std", "fit_limbs", "held_out_spread", "summary"]
-
 
 @dataclass(frozen=True)
 class LimbStates:

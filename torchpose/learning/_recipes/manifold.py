@@ -37,15 +37,6 @@ from torchpose.learning._recipes.choosing import (
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._manifold.manifold_file import ManifoldInfo
 
-__all__ = [
-    "ManifoldFitting",
-    "ManifoldPoses",
-    "ManifoldRecipe",
-    "check_gathering",
-    "run_to_end",
-    "taken_up",
-]
-
 
 @dataclass(frozen=True)
 class ManifoldRecipe:

@@ -4,8 +4,6 @@ from typing import TypedDict
 
 from torchpose.priors._window import WindowLayout
 
-__all__ = ["RecipeSettings"]
-
 
 class RecipeSettings(TypedDict, total=False):
     """The fields of `UpperBodyRecipe` but for the first ones that `fit_kinect_prior` names itself."""

@@ -43,8 +43,6 @@ from torchpose.priors._prior_file import PriorInfo
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 
-__all__ = ["VERSION", "UpperBodyRecipe", "fit_kinect_prior"]
-
 VERSION = "5"
 """Version of the recipe; cached priors of another version are not used."""
 

@@ -11,18 +11,6 @@ from torchpose.measure._detectors.protocol import Detections
 from torchpose.measure._face import nearest_pairs
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = [
-    "PersonTracks",
-    "associate",
-    "crop_boxes",
-    "least_seen",
-    "no_tracks",
-    "person_scale",
-    "pseudo_faces",
-    "upper_rows",
-    "without_doubles",
-]
-
 _GATE = (
     0.5  # mean distance of the keypoints in scales of the person, within which it is the same one
 )

@@ -8,15 +8,6 @@ from torch import Tensor
 
 from torchpose.measure._detectors.protocol import Detections
 
-__all__ = [
-    "LEAST_SCORE",
-    "decode_movenet_multi",
-    "decode_rtmo",
-    "decode_yolo",
-    "decode_yolo_suppressed",
-    "suppress_overlaps",
-]
-
 LEAST_SCORE = 0.3
 """Of a person, from which on a detection counts."""
 _OVERLAP = 0.65  # of two boxes, intersection over union, from which on they are one person

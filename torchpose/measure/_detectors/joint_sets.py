@@ -8,8 +8,6 @@ from torchpose.errors import InputError
 from torchpose.measure._detectors.protocol import Detections
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
-__all__ = ["COUNTS", "KNOWN", "JointSet", "joint_set", "select_joints"]
-
 COCO = (
     "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
     "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",

@@ -23,8 +23,6 @@ from torchpose.measure._detectors.top_down import (
     decode_simcc,
 )
 
-__all__ = ["Layout", "Shape", "as_tensors", "find_layout"]
-
 Shape = tuple[int, ...]
 Size = tuple[int, int]
 

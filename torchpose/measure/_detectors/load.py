@@ -11,8 +11,6 @@ from torchpose.measure._detectors.onnx_model import load_onnx
 from torchpose.measure._detectors.protocol import KeypointDetector
 from torchpose.skeleton._upper_body import upper_body_indices
 
-__all__ = ["check_detector", "load_detector"]
-
 _KINDS = (
     "an ONNX model (.onnx), a pose landmarker of MediaPipe (.task), or package:factory, a callable "
     "without arguments in a Python module that returns a detector"

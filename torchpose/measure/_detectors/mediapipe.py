@@ -7,8 +7,6 @@ from torch import Tensor
 from torchpose._core.images import Image
 from torchpose.measure._mediapipe import MediaPipePose
 
-__all__ = ["MediaPipeDetector"]
-
 
 class MediaPipeDetector:
     """Detects the landmarks of all persons; frames are taken to be equally far apart.

@@ -11,8 +11,6 @@ import numpy as np
 from torchpose.errors import FileFormatError, InputError, MissingDependencyError
 from torchpose.measure._detectors.onnx_header import TensorInfo, read_inputs
 
-__all__ = ["ImageInput", "Network", "image_input", "open_network"]
-
 _FREE = {
     True: 256,
     False: 640,

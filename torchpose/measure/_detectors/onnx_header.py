@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from torchpose.errors import FileFormatError
 
-__all__ = ["TensorInfo", "read_inputs"]
-
 _GRAPH, _INITIALIZER, _INPUT = 7, 5, 11  # of ModelProto and GraphProto
 _NAME, _TYPE, _TENSOR_NAME = 1, 2, 8  # of ValueInfoProto and TensorProto
 _ELEMENTS = {1: "float32", 2: "uint8", 3: "int8", 6: "int32", 7: "int64", 10: "float16"}

@@ -14,8 +14,6 @@ from torchpose.measure._detectors.networks import Network, image_input, open_net
 from torchpose.measure._detectors.protocol import Detections
 from torchpose.measure._detectors.views import view, whole
 
-__all__ = ["CroppingOnnxModel", "OnnxModel", "load_onnx"]
-
 
 class OnnxModel:
     """Detects the keypoints of all persons by a model that sees the whole image.

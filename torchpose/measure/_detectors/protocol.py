@@ -11,8 +11,6 @@ from torch import Tensor
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 
-__all__ = ["CroppingDetector", "Detections", "KeypointDetector", "checked_detections"]
-
 
 class Detections(NamedTuple):
     """Holds the keypoints of the N persons in a frame.

@@ -6,8 +6,6 @@ from torch import Tensor
 
 from torchpose.measure._detectors.protocol import Detections
 
-__all__ = ["decode_heatmaps", "decode_movenet_single", "decode_simcc"]
-
 _NUDGE = 0.25  # cells, from the highest cell of a heatmap towards its higher neighbour
 
 

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from torchpose._core.images import Image
 
-__all__ = ["View", "view", "whole"]
-
 
 class View(NamedTuple):
     """Holds the pixels that a model sees, and where they are from.

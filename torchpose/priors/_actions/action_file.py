@@ -10,8 +10,6 @@ from torch import Tensor
 from torchpose._core.tensor_file import FileKind
 from torchpose.priors._actions.polar_limbs import LIMBS_12
 
-__all__ = ["BANK_FILE", "SPACE_FILE", "ActionInfo", "BankInfo", "Synchronised"]
-
 _LIMBS = tuple(limb.name for limb in LIMBS_12)
 
 

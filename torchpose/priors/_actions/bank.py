@@ -35,8 +35,6 @@ from torchpose.priors._actions.stack import (
     stack_spaces,
 )
 
-__all__ = ["ActionBank"]
-
 
 class ActionBank(nn.Module):
     """Holds the action spaces of several actions, padded to one size, with one more state: none of them.

@@ -10,17 +10,6 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.priors._actions.postures import normalise_postures
 
-__all__ = [
-    "CLAMP_ROUNDS",
-    "GATE_WIDTH",
-    "Acceptance",
-    "check_gate_width",
-    "clamp_in_rounds",
-    "clamp_offset",
-    "match_postures",
-    "passes_any_gate",
-]
-
 GATE_WIDTH = 2.0
 """Deviations on either side of the matched posture that (AS 6) allows."""
 

@@ -16,8 +16,6 @@ from torchpose.math._tree_messages import tree_levels
 from torchpose.priors._actions.polar_limbs import LIMB_PARENTS, LIMBS_12, POSTURE_DIM
 from torchpose.priors._actions.postures import check_body
 
-__all__ = ["PartPostures"]
-
 Vectors = tuple[Tensor, Tensor, Tensor]  # x, y, z, each [k, n]
 
 _LEAST = 1e-12  # of 1 + cosine, where the smallest rotation is not defined

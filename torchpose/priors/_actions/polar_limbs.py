@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 from torchpose.errors import SkeletonError
 
-__all__ = ["LIMBS_12", "LIMB_PARENTS", "POSTURE_DIM", "PolarLimb", "check_limbs"]
-
 Axis = tuple[float, float, float]
 
 

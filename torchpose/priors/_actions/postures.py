@@ -34,16 +34,6 @@ from torchpose.priors._actions.polar_limbs import (
     POSTURE_DIM,
 )
 
-__all__ = [
-    "check_body",
-    "normalise_postures",
-    "posture_angles",
-    "posture_directions",
-    "posture_root",
-    "posture_to_state",
-    "state_postures",
-]
-
 _TINY = 1e-6  # metres or sines: nothing shorter has a direction
 
 

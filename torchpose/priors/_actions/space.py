@@ -26,8 +26,6 @@ from torchpose.priors._actions.gate import (
 )
 from torchpose.priors._actions.polar_limbs import POSTURE_DIM, check_limbs
 
-__all__ = ["ActionSpace"]
-
 
 class ActionSpace(nn.Module):
     """Holds the action model Gamma = (Omega, g, sigma_k) of aSpace, over postures of 36 angles in degrees.

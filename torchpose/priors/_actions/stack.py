@@ -11,17 +11,6 @@ from torchpose.errors import InputError
 from torchpose.priors._actions.polar_limbs import POSTURE_DIM
 from torchpose.priors._actions.space import ActionSpace
 
-__all__ = [
-    "NONE",
-    "chain_step",
-    "chain_transition",
-    "check_chain",
-    "common_frame_rate",
-    "evidence_share",
-    "names_of",
-    "stack_spaces",
-]
-
 NONE = "none"
 """Name of the last state: none of the known actions."""
 

@@ -31,8 +31,6 @@ from torchpose.priors._manifold.manifold_file import (
 )
 from torchpose.priors._manifold.prediction import Fitted, KernelParameters, Prepared
 
-__all__ = ["LEAST_FRAMES", "BackConstrainedGPLVM", "MotionNoise", "join_sequences", "no_noise"]
-
 LEAST_FRAMES = 10
 """Of the poses of a manifold."""
 

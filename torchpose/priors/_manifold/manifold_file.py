@@ -20,8 +20,6 @@ from torchpose._core.tensor_file import (
 from torchpose.errors import PriorError
 from torchpose.priors._facts import ManifoldFacts
 
-__all__ = ["TENSORS", "ManifoldInfo", "read_manifold", "write_manifold"]
-
 _GROWTH = "noise_growth"  # in `extra`: exponents of standard deviations over time
 _SAME_FRAME_RATE = 0.01  # of it
 _SAME_CENTRE = 1e-6  # of a quaternion vector

@@ -8,20 +8,6 @@ from torch import Tensor
 
 from torchpose.math._gaussian import least_exponent, safe_cholesky
 
-__all__ = [
-    "Fitted",
-    "KernelParameters",
-    "Prepared",
-    "covariance",
-    "prepare",
-    "rbf",
-    "rbf_rows",
-    "rbf_with_rows",
-    "to_latent",
-    "to_pose",
-    "to_pose_mean",
-]
-
 _JITTER = 1e-8  # of the kernel's variance, added to the noise: a fit may drive the noise to nothing
 _CHUNK = 512  # points per product, so that their kernel values stay in the cache
 

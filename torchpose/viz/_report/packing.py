@@ -11,8 +11,6 @@ from torch import Tensor
 
 from torchpose.metrics._calibration import chi2_quantile
 
-__all__ = ["CURVE_POINTS", "MAX_POSES", "ReportedTrack", "Thinned", "pack_array", "pack_person"]
-
 CURVE_POINTS = 4000
 """Points of a curve in the page, at most."""
 

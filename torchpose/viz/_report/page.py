@@ -29,8 +29,6 @@ from torchpose.viz._report.packing import (
 )
 from torchpose.viz._style import readable, side_of
 
-__all__ = ["MAX_EMBEDDED", "write_report"]
-
 MAX_EMBEDDED = 64 * 2**20
 """Largest overlay that is embedded in the page, bytes; a larger one is linked."""
 

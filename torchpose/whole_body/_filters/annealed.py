@@ -28,8 +28,6 @@ from torchpose.whole_body._filters.body_particles import (
 )
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
-__all__ = ["AnnealedParticleFilter", "Annealing", "anneal"]
-
 _LAYERS, _SURVIVAL = 5, 0.5
 
 

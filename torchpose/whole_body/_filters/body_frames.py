@@ -21,20 +21,6 @@ from torchpose.whole_body._silhouettes.rendering import (
     prepare_silhouettes,
 )
 
-__all__ = [
-    "Frame",
-    "Likelihood",
-    "Score",
-    "check_observation",
-    "check_observations",
-    "check_sequences",
-    "is_seen",
-    "see_frame",
-    "seen_until",
-    "silhouette_score",
-    "with_keypoints",
-]
-
 Score = Callable[[Tensor], Tensor]
 Likelihood = Callable[[Tensor, Tensor], Tensor]
 

@@ -17,25 +17,6 @@ from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._resampling import resample
 from torchpose.whole_body._filters.body_frames import Likelihood
 
-__all__ = [
-    "BodyFilterOptions",
-    "BodyFilterOutput",
-    "BodyFilterState",
-    "PoseSpace",
-    "WeightedParticles",
-    "WeightingOptions",
-    "best_particle",
-    "first_true",
-    "joint_covariance",
-    "particle_std",
-    "resample_state",
-    "reweight",
-    "stack_outputs",
-    "take_particles",
-    "warn_of_frames",
-    "without_repeats",
-]
-
 _LISTED = 8  # frames that a warning names
 
 

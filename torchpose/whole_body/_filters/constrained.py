@@ -35,8 +35,6 @@ from torchpose.whole_body._filters.posture_gate import (
 )
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
-__all__ = ["CONSTRAINED_WEIGHTS", "ConstrainedParticleFilter"]
-
 CONSTRAINED_WEIGHTS = ("published", "normalised")
 _RELATIVE = slice(6, None)  # the columns of a state that a posture depends on
 _COMMON_HEIGHT = 1.75  # metres, of the body on which the postures of actions are told

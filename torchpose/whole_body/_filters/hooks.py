@@ -20,8 +20,6 @@ from torchpose.whole_body._filters.body_particles import (
 )
 from torchpose.whole_body._filters.motion import default_step_std
 
-__all__ = ["BodyFilterHooks"]
-
 _SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
 _DIED = (
     "all particles died {times} times ({frames}) and were spread about the last mean; use more "

@@ -12,15 +12,6 @@ from torchpose.errors import InputError, SkeletonError
 from torchpose.filters._recursive_filter import Generators, uniform
 from torchpose.math._rotations import compose, conjugate
 
-__all__ = [
-    "check_leg_swap",
-    "exchange_legs",
-    "extra_copies",
-    "leg_angle",
-    "leg_permutation",
-    "swap_legs",
-]
-
 _LEG_PARTS = ("thigh", "shank")
 _ROOT_COLUMNS = 3  # the position; the vectors of all parts follow
 

@@ -22,17 +22,6 @@ from torchpose.math._unscented import floor_eigenvalues, moments
 from torchpose.whole_body._silhouettes.limb_counts import PartCounts, count_parts
 from torchpose.whole_body._silhouettes.rendering import PreparedSilhouettes
 
-__all__ = [
-    "CAMERA_RULES",
-    "NORMALISATIONS",
-    "PartGroup",
-    "count_positions",
-    "observation_gaussians",
-    "part_groups",
-    "part_log_likelihood",
-    "part_positions",
-]
-
 NORMALISATIONS = ("published", "share")
 CAMERA_RULES = ("product", "sum")
 _LEAST_SHARE = 0.01  # of a part's pixels: one camera alone does not rule a place out

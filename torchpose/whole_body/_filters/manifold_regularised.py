@@ -20,8 +20,6 @@ from torchpose.whole_body._filters.body_particles import (
 from torchpose.whole_body._filters.motion import default_step_std
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
-__all__ = ["MANIFOLD_PROPOSALS", "MANIFOLD_WEIGHTS", "ManifoldParticleFilter", "PoseManifold"]
-
 MANIFOLD_WEIGHTS = ("published", "normalised")
 MANIFOLD_PROPOSALS = ("diffusion", "product")
 _TRACKING_STEP = 2.0  # times sigma x->x, which was learnt from the true poses

@@ -15,16 +15,6 @@ from torchpose._core.checks import check_finite, check_positive, check_shape
 from torchpose.errors import InputError
 from torchpose.whole_body._filters.body_particles import PoseSpace
 
-__all__ = [
-    "constant_velocity_std",
-    "default_step_std",
-    "diffusion_std",
-    "motion_std",
-    "next_velocity",
-    "rescale_std",
-    "std_of_covariance",
-]
-
 # Per frame at 60 Hz, about twice the motion of a walk: metres, then sines of half angles.
 _POSITION_STD, _HEADING_STD, _PART_STD = 0.015, 0.015, 0.03
 _RATE = 60.0  # frames per second for which these are

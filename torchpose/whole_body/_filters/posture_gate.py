@@ -20,8 +20,6 @@ from torchpose.priors._actions.part_postures import PartPostures
 from torchpose.priors._actions.postures import posture_to_state
 from torchpose.priors._actions.space import ActionSpace
 
-__all__ = ["PostureGate", "Redrawn", "Rows", "all_accepted", "redraw_until_accepted"]
-
 Actions = Int[Tensor, " R"] | None
 
 

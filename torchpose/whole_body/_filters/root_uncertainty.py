@@ -57,8 +57,6 @@ from torchpose.whole_body._keypoints.particle_likelihood import (
     limbs_given_keypoints,
 )
 
-__all__ = ["PUBLISHED", "WEIGHTINGS", "RootUncertaintyTracker", "joint_covariance_with_parts"]
-
 WEIGHTINGS = ("parts", "body")
 PUBLISHED: dict[str, Any] = {
     "survival_per_second": 0.01,

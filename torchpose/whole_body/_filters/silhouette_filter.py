@@ -54,8 +54,6 @@ from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurem
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 from torchpose.whole_body._silhouettes.outlines import check_limb_shape
 
-__all__ = ["SilhouetteParticleFilter"]
-
 _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost keeps growing
 
 

@@ -16,8 +16,6 @@ from torchpose.whole_body._filters.body_particles import (
 )
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
-__all__ = ["SIRParticleFilter"]
-
 
 class SIRParticleFilter(SilhouetteParticleFilter):
     """Filters by the Condensation algorithm: diffuse, weigh by the image, resample.

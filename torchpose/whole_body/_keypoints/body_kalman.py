@@ -42,8 +42,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.upright import Upright
 
-__all__ = ["BodyGaussian", "BodyKalmanFilter", "CorrectedBody"]
-
 _JITTER = (
     1e-9  # share of a joint's information that is added along every axis, so that it has a factor
 )

@@ -11,8 +11,6 @@ from torchpose.body._articulation import BodyPoint
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 
-__all__ = ["SmoothedBodies", "smooth"]
-
 
 class SmoothedBodies(NamedTuple):
     """Holds smoothed points [T, B] and their covariances [T, B, N, N]."""

@@ -10,8 +10,6 @@ from torch import Tensor
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._body_motion import BodyMotion
 
-__all__ = ["BodyTransition", "jump_variance", "transition"]
-
 _SCALE_DRIFT = 0.002  # of the log of a bone's length, per root of a second
 _EXCHANGES = 0.1  # per second and camera, sides begin to be exchanged
 _RETURNS = 3.0  # and end to be, while they are

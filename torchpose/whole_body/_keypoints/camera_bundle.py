@@ -35,18 +35,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 
-__all__ = [
-    "N_ERRORS",
-    "ROTATION_STD",
-    "SHIFT_STD",
-    "Adjusted",
-    "BundleInputs",
-    "CameraErrors",
-    "adjust",
-    "by_pose",
-    "corrected_pose",
-]
-
 N_ERRORS = 7  # of a camera: rotation, shift, delay
 ROTATION_STD, SHIFT_STD = 0.0175, 0.03  # radians, metres
 _EXCHANGED = -3.5  # prior log-odds of exchanged sides

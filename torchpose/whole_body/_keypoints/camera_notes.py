@@ -17,8 +17,6 @@ from torchpose.whole_body._keypoints.camera_refinement import (
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame
 
-__all__ = ["CameraDoubts", "doubt_cameras", "notes_on_cameras", "notes_on_refined"]
-
 _FRAMES = 150  # at most, of those that are looked at
 _WIDTHS = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)
 _LEAST_DELAY = 0.5  # frames

@@ -33,15 +33,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 )
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses
 
-__all__ = [
-    "REFINED",
-    "RefinedCameras",
-    "details_of_cameras",
-    "free_errors",
-    "given_for",
-    "refine_cameras",
-]
-
 REFINED = ("none", "delays", "extrinsics", "both")
 DELAY = N_ERRORS - 1
 _LONGEST, _LEAST_LONGEST = 0.3, 10  # seconds, and frames at least, of a delay that is looked for

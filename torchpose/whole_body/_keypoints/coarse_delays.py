@@ -10,8 +10,6 @@ from torchpose.camera._rig import CameraRig
 from torchpose.math._rotations import cross_matrix
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
-__all__ = ["coarse_delays", "shifted"]
-
 _ROUNDS = 10  # over all cameras, at most
 _LEAST_PIXELS = 1.0
 

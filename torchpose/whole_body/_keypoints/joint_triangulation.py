@@ -8,8 +8,6 @@ from torch import Tensor
 
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
 
-__all__ = ["triangulate"]
-
 _AGREE = 6.0  # standard deviations of the noise within which a camera agrees
 
 

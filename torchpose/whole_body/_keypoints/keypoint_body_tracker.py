@@ -47,8 +47,6 @@ from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import known_up
 
-__all__ = ["INLIER", "KEYPOINT_METHOD", "PIXEL_STD", "KeypointBodyTracker"]
-
 KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
 INLIER = (0.05, 0.97)

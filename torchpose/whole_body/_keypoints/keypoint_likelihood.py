@@ -23,23 +23,6 @@ from torch import Tensor
 from torchpose.body._skeleton import BodySkeleton, other_side
 from torchpose.camera._rig import CameraRig
 
-__all__ = [
-    "LEAST_DEPTH",
-    "NOISE_SCALES",
-    "Beliefs",
-    "Exchange",
-    "KeypointFrame",
-    "RigMaps",
-    "Seen",
-    "Weighed",
-    "exchange_of",
-    "information",
-    "readings_of",
-    "see",
-    "squared_errors",
-    "weigh",
-]
-
 NOISE_SCALES = (0.3, 20.0)  # least and largest factor of a camera's noise
 LEAST_DEPTH = 0.05  # metres in front of a camera; nearer points are not seen by it
 _LEAST = 1e-30  # probability

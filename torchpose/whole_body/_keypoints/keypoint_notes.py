@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["TOO_FEW", "late_note", "notes_of"]
-
 TOO_FEW = "too few keypoints were given"
 """Why a track begins late."""
 

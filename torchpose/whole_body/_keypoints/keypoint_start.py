@@ -26,8 +26,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.lifted_pose import corrected_by
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 
-__all__ = ["start", "start_of_one"]
-
 _HEADINGS = 8
 _WIDTHS = (
     400.0,

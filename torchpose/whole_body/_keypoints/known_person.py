@@ -11,8 +11,6 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.errors import SkeletonError
 from torchpose.priors._body_motion import BodyMotion
 
-__all__ = ["length_of_legs", "of_one_camera", "std_of_legs", "with_body", "with_height"]
-
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height

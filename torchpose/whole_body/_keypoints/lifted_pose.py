@@ -29,8 +29,6 @@ from torchpose.whole_body._keypoints.lifting_network import (
     shipped_lifting_network,
 )
 
-__all__ = ["PoseLifter", "contradicts", "corrected_by", "place_on_rays"]
-
 _FACTOR = (
     1.5  # on the network's standard deviations, which are those of persons that it was fitted to
 )

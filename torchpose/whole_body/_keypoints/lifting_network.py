@@ -15,16 +15,6 @@ from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
 from torchpose.body._skeleton import BODY_15
 
-__all__ = [
-    "INPUTS",
-    "MEMORY",
-    "Lifted",
-    "LiftingNetwork",
-    "LiftingNetworkInfo",
-    "lifting_features",
-    "shipped_lifting_network",
-]
-
 _SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "lifting" / "whole-body.safetensors"
 _JOINTS = len(BODY_15.names)
 INPUTS = 4 * _JOINTS + 4

@@ -13,8 +13,6 @@ from torch import Tensor
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
-__all__ = ["NOBODY", "SAME_NOISE", "LoneNoise", "frame_of", "into_all", "of_any_size", "state_of"]
-
 NOBODY = -1
 """In place of the camera that alone sees a person, where there is none."""
 

@@ -5,8 +5,6 @@ from typing import Any
 
 from torch import Tensor
 
-__all__ = ["mapped", "taken"]
-
 
 def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
     """Return a tuple of what a function makes of each entry, and of the same entry of the others.

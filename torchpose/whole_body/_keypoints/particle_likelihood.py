@@ -35,8 +35,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 
-__all__ = ["KeypointMeasurement", "keypoint_log_likelihood", "limbs_given_keypoints"]
-
 _POWER = 0.1  # k
 _LOG_ODDS = -3.0  # of exchanged sides in a camera and frame
 _ROOT = 6  # columns of a state: position and orientation of the root

@@ -31,15 +31,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 
-__all__ = [
-    "assign",
-    "detection_gains",
-    "group_detections",
-    "left_over",
-    "owned_detections",
-    "taken_detections",
-]
-
 LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
 _BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
 _AGREE = 0.5  # share of the joints of two detections that must be triangulated

@@ -25,8 +25,6 @@ from torchpose.whole_body._keypoints.people_tracker import (
     PeopleTracker,
 )
 
-__all__ = ["ALL_PERSONS", "PeopleBodyTracker"]
-
 ALL_PERSONS = "all"
 
 

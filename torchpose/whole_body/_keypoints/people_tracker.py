@@ -24,8 +24,6 @@ from torchpose.whole_body._keypoints.people_association import (
     taken_detections,
 )
 
-__all__ = ["PeopleFrame", "PeopleStream", "PeopleTracker"]
-
 _CONFIRM_TIME, _CONFIRM_FRAMES = 0.1, 3  # seconds, and frames at least, that confirm a person
 _TENTATIVE_TIME = 0.1  # seconds without agreeing cameras after which somebody unconfirmed is nobody
 _GONE_TIME = 1.0  # seconds without keypoints after which a person has left

@@ -10,8 +10,6 @@ from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_files import UP_AXES
 
-__all__ = ["Lean", "Upright", "camera_up", "known_up"]
-
 # Of the upward direction in the axes of the pelvis, to the left and forward.
 _MEAN, _STD = (0.0, -0.1), (0.08, 0.08)
 _TILT = (0.1, 0.1)  # radians, of the roll and pitch of a camera

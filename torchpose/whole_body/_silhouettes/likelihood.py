@@ -12,8 +12,6 @@ from torchpose._core.checks import check_choice
 from torchpose.errors import InputError
 from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
-__all__ = ["LIKELIHOODS", "bidirectional", "intersection_over_union", "silhouette_log_likelihood"]
-
 
 def bidirectional(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
     """Return the bidirectional silhouette log-likelihood, up to a constant.

@@ -21,15 +21,6 @@ from torchpose.whole_body._silhouettes.outlines import (
     project_limbs,
 )
 
-__all__ = [
-    "checked_limbs",
-    "count_intervals",
-    "flatten_limbs",
-    "in_chunks",
-    "intervals_of",
-    "which_silhouette",
-]
-
 # Intervals in one chunk: with fewer the overhead of calls shows, with more only the memory grows.
 _INTERVALS, _INTERVALS_GPU = 2**17, 2**22
 _KEPT = 2**25 - 2**16  # bytes; glibc adapts to freed blocks of at most 32 MB

@@ -22,8 +22,6 @@ from torchpose.whole_body._silhouettes.limb_batches import (
 from torchpose.whole_body._silhouettes.outlines import NEAR, RowIntervals, Strip
 from torchpose.whole_body._silhouettes.rendering import PreparedSilhouettes, prepare_silhouettes
 
-__all__ = ["PartCounts", "count_parts"]
-
 
 class PartCounts(NamedTuple):
     """Holds the weighted pixels of each position of a part in each camera.

@@ -32,21 +32,6 @@ from torchpose._core.checks import check_choice
 from torchpose.body._limbs import Limbs
 from torchpose.camera._rig import CameraRig
 
-__all__ = [
-    "LEVEL",
-    "LIMB_SHAPES",
-    "NEAR",
-    "Outlines",
-    "ProjectedLimbs",
-    "RowIntervals",
-    "Strip",
-    "check_limb_shape",
-    "limb_intervals",
-    "outline",
-    "outline_rectangles",
-    "project_limbs",
-]
-
 NEAR = 0.1
 """Metres in front of a camera; nearer parts of a limb are cut off."""
 

@@ -25,16 +25,6 @@ from torchpose.whole_body._silhouettes.limb_batches import (
 )
 from torchpose.whole_body._silhouettes.outlines import NEAR, RowIntervals, Strip, check_limb_shape
 
-__all__ = [
-    "HasLimbs",
-    "PreparedSilhouettes",
-    "SilhouetteCounts",
-    "count_pixels",
-    "prepare_silhouettes",
-    "render",
-    "render_limbs",
-]
-
 _PIXELS = 2**22  # rendered in one chunk
 
 

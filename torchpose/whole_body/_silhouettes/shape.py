@@ -17,8 +17,6 @@ from torchpose.whole_body._silhouettes.rendering import (
     prepare_silhouettes,
 )
 
-__all__ = ["fit_radii"]
-
 _SPREAD = 0.2  # of the logarithm of a factor among people and clothes, standard deviation
 _PRIOR = 0.01  # of intersection over union, what factors one standard deviation off cost
 _LEAST_SPREAD = 0.01  # of the search, so that it does not settle too soon
