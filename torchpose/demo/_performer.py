@@ -20,23 +20,6 @@ from torchpose.errors import InputError
 from torchpose.math._rotations import euler_to_matrix
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = [
-    "ANGLE_LIMITS",
-    "KEYPOINT_NAMES",
-    "BodyAngles",
-    "BodySize",
-    "Performance",
-    "angles_to_joints",
-    "demo_camera",
-    "hip_sway",
-    "minimum_jerk",
-    "noisy_keypoints",
-    "performer",
-    "performer_angles",
-    "stage",
-    "sway",
-]
-
 KEYPOINT_NAMES = ("head", "neck", "hand_left", "hand_right")
 """Names of the keypoints of `noisy_keypoints`, in its order."""
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchpose._core.checks import check_count, check_rate, check_shape
 from torchpose.errors import InputError
-from torchpose.learning._performances import Synchronised, checked_performances, synchronise
-from torchpose.priors._actions.action_file import ActionInfo
+from torchpose.learning._performances import checked_performances, synchronise
+from torchpose.priors._actions.action_file import ActionInfo, Synchronised
 from torchpose.priors._actions.polar_limbs import POSTURE_DIM
 from torchpose.priors._actions.space import ActionSpace
 

@@ -17,18 +17,6 @@ from torchpose._core.checks import check_finite, check_shape
 from torchpose.errors import InputError
 from torchpose.priors._actions.action_file import Synchronised
 
-__all__ = [
-    "LEAST_FRAMES",
-    "Synchronised",
-    "checked_performances",
-    "find_key_frames",
-    "match_key_frames",
-    "natural_spline",
-    "repetition_axis",
-    "split_repetitions",
-    "synchronise",
-]
-
 LEAST_FRAMES = 8
 """A performance has at least as many, and more than there are key frames."""
 

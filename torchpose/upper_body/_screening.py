@@ -34,8 +34,6 @@ from torchpose.upper_body._screen_tracks import (
     update_tracks,
 )
 
-__all__ = ["ScreenState", "Screened", "advance_screen", "screen_joints"]
-
 _LEFT, _RIGHT = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
 # Of OpenPose's wrists and elbows, beside the truth: the confidence at which every second is an outlier,
 # and the step of confidence in which odds change by e.

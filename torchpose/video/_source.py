@@ -7,9 +7,7 @@ from torchpose.errors import InputError
 from torchpose.video._camera import CameraSource
 from torchpose.video._file import FileSource
 from torchpose.video._images import FolderSource
-from torchpose.video._source_interface import VideoFrame, VideoSource
-
-__all__ = ["VideoFrame", "VideoSource", "open_video"]
+from torchpose.video._source_interface import VideoSource
 
 _KINDS = ("file", "folder", "camera")
 

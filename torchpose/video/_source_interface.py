@@ -7,8 +7,6 @@ from typing import NamedTuple, Self
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 
-__all__ = ["Image", "VideoFrame", "VideoSource"]
-
 
 class VideoFrame(NamedTuple):
     """Holds one frame of a video.

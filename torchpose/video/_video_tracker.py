@@ -57,8 +57,6 @@ from torchpose.video._person_stream import (
 from torchpose.video._prefetch import prefetch
 from torchpose.video._recording import TrackedPerson, TrackedRecording
 
-__all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
-
 Watcher = Callable[[Image, Found, dict[int, PoseTrack]], None]
 """Is called with a frame, its measurements, and the poses of the persons in it by number."""
 

@@ -23,8 +23,6 @@ from torchpose.demo._rendering.scene import Scene, Sensor, room
 from torchpose.errors import CameraError, InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["Image", "Truth", "performance_truth", "render_performance", "render_video"]
-
 _STEP = 2.0  # pixels of movement for one picture of the motion blur
 _MOST = 8  # pictures of the motion blur
 _STILL = 0.5  # pixels: what moves less is painted once

@@ -17,12 +17,7 @@ from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._action_spaces import Performed, fit_synchronised
-from torchpose.learning._performances import (
-    LEAST_FRAMES,
-    Synchronised,
-    repetition_axis,
-    split_repetitions,
-)
+from torchpose.learning._performances import LEAST_FRAMES, repetition_axis, split_repetitions
 from torchpose.learning._recipes.choosing import (
     body_of_each,
     choose_recordings,
@@ -32,7 +27,7 @@ from torchpose.learning._recipes.choosing import (
     recording_name,
     state_of,
 )
-from torchpose.priors._actions.action_file import ActionInfo, BankInfo
+from torchpose.priors._actions.action_file import ActionInfo, BankInfo, Synchronised
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.priors._actions.space import ActionSpace
