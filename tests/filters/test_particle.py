@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.data import data_dir_or_skip
+from tests.filters.linear_poses import assert_within_error
 from tests.filters.oracles import (
     dense_posterior,
     paper_transition,
@@ -45,13 +46,6 @@ def runs_of(tracker, z, mask=None, runs=48, seed=0, **options):
     z = z[None].expand(runs, -1, -1)
     mask = None if mask is None else mask[None].expand(runs, -1, -1)
     return tracker(z, mask, generator=generator(seed), **options)
-
-
-def assert_within_error(samples, exact, slack=0.0, factor=5.0):
-    """The mean over runs (dimension 0) agrees with the exact value, given its own standard error."""
-    error = samples.std(0) / len(samples) ** 0.5
-    distance = (samples.mean(0) - exact).abs()
-    assert (distance <= factor * error + slack).all(), (distance / error).max()
 
 
 # --- one component: the model is linear and Gaussian, and the exact answer is a dense Gaussian

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.filters.linear_poses import LinearBody
-from torchpose.body import BODY_15, Body, JointLimits
+from tests.whole_body.filters.walking_body import walker
+from torchpose.body import BODY_15, JointLimits
 from torchpose.errors import DegenerateFilterWarning, InputError, SkeletonError
 from torchpose.whole_body import (
     AnnealedParticleFilter,
@@ -117,10 +118,6 @@ def test_particles_that_died_start_with_a_memory_of_their_own():
 
 
 # --- legs
-
-
-def walker():
-    return Body.of_height(BODY_15, 1.75)
 
 
 def strides(body, n=1):
