@@ -153,6 +153,11 @@ def test_a_module_is_found_by_its_old_path_with_a_warning(old, present):
     assert any(said in str(warning.message) for warning in caught)
 
 
+@pytest.mark.parametrize("module", NAMES)
+def test_what_had_other_names_lists_its_own(module):
+    assert dir(import_module(module))
+
+
 def test_a_name_that_no_room_had_is_refused():
     with pytest.raises(AttributeError, match=r"torchpose\.math.* no attribute 'no_such_name'"):
         import_module("torchpose.math").no_such_name  # noqa: B018

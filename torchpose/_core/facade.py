@@ -7,16 +7,17 @@ from torchpose._core.moved import NAMES, moved_names
 
 
 def set_up_facade(module: str) -> None:
-    """Give a room its `__dir__`, and its `__getattr__` for names that have left it.
+    """Give a room its `__dir__`, and a room or module its `__getattr__` for names that have left it.
 
     Both are set here and not written in the room, so that type checkers go by the imports there and
     report a name that does not exist.
 
     Args:
-        module: `__name__` of the room, whose `__all__` is set before the first call of `dir`.
+        module: `__name__` of the room, whose `__all__` is set before, or of a private module, which has none.
     """
     names = vars(sys.modules[module])
-    names["__dir__"] = list_public(module)
+    if "__all__" in names:
+        names["__dir__"] = list_public(module)
     if module in NAMES:
         names["__getattr__"] = moved_names(module)
 
