@@ -381,7 +381,18 @@ def test_joints_are_drawn_where_the_lens_puts_them(fisheye):
         again = CameraRig([camera]).undistort_points(found[None])[0]
         torch.testing.assert_close(again[:2], straight, rtol=0, atol=1e-4)
         moved = (found[:2] - straight).norm(dim=-1)
-        assert bool(moved.max() > 1) == (length > 0)
+        assert bool(moved.max() > 1) == (length > 0 or fisheye)
+
+
+@pytest.mark.parametrize("distortions", [(-0.3,), (-0.25, 0.05, 0, 0, -0.005)])
+def test_joints_beside_the_image_are_not_folded_into_it(distortions):
+    camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=distortions)
+    aside = torch.linspace(0.0, 6.0, 121).double()
+    level = torch.zeros_like(aside)
+    u = project_joints(torch.stack([aside, level, level + 1], -1), camera)[:, 0]
+    there = int(u.isfinite().sum())
+    assert aside[there] > 0.8 and u[there:].isnan().all()  # where the lens still tells them apart
+    assert (u[:there].diff() > 0).all()
 
 
 def test_videos_are_not_read_past_the_last_pose(tmp_path):
