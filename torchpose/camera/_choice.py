@@ -3,19 +3,22 @@
 A calibrated camera is fitted to the size of the images that the input has.
 """
 
+from itertools import combinations
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import intrinsics
-from torchpose.camera._rig import is_distorted, scale_matrix
+from torchpose.camera._rig import CameraRig, is_distorted, scale_matrix
 from torchpose.errors import CameraError, InputError
 
-__all__ = ["fit_to_size", "is_padded", "resolve_camera"]
+__all__ = ["check_room", "fit_to_size", "is_padded", "resolve_camera"]
 
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _LEAST_FOCAL = 10.0  # pixels
+_FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
 _SQUEEZED = 0.02  # of the ratio of the sides: images of another shape are cut, and not scaled
 
 
@@ -28,8 +31,8 @@ def resolve_camera(
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
     """Return the camera of keypoints or of a video, and notes on assumptions.
 
-    In this order: what was given, scaled to the input's images; K that came with the input; its image size with f = 525/640 of the
-    longer side.
+    In this order: what was given, scaled to the input's images; K that came with the input; its image
+    size with f = 525/640 of the longer side.
 
     Args:
         given: a TOML file, or ``fx,fy,cx,cy`` for images of the input's size.
@@ -149,3 +152,22 @@ def _of_size(camera: PinholeCamera, matrix: Tensor, size: tuple[int, int]) -> Pi
         rotation=camera.rotation.tolist(), translation=camera.translation.tolist(),
         fisheye=camera.fisheye,
     )  # fmt: skip
+
+
+def check_room(rig: CameraRig) -> None:
+    """Raise `CameraError` for cameras farther away than any room is large, and for two with one pose."""
+    far = rig.translation.norm(dim=-1)
+    if bool((far > _FARTHEST).any()):
+        raise CameraError(
+            f"cameras must be given in metres, got camera {rig.names[int(far.argmax())]!r} "
+            f"{float(far.max()):g} m from the origin; divide translations in millimetres by 1000"
+        )
+    for a, b in combinations(range(len(rig)), 2):
+        if torch.equal(rig.rotation[a], rig.rotation[b]) and torch.equal(
+            rig.translation[a], rig.translation[b]
+        ):
+            raise CameraError(
+                f"cameras {rig.names[a]!r} and {rig.names[b]!r} are in the same place with the same "
+                "rotation; expected `rotation` and `translation` of each, of a calibration of all "
+                "cameras together"
+            )
