@@ -34,6 +34,7 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     details_of_cameras,
     refine_cameras,
 )
+from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note, notes_of
 from torchpose.whole_body._keypoints.keypoint_tracker import (
@@ -134,6 +135,7 @@ class KeypointBodyTracker(nn.Module):
         single = keypoints.ndim == 4
         if single:
             frames = frames.map(lambda value: value[None])
+        check_units(self.tracker.filter.maps, frames, self.tracker.filter.motion)
         begun = self.first_frames(frames)
         if refine != "none":
             frames = frames.map(lambda value: value[:, begun[0] :])
