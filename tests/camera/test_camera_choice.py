@@ -5,7 +5,7 @@ import torch
 
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.camera._choice import fit_to_size, is_padded, resolve_camera
-from torchpose.errors import CameraError
+from torchpose.errors import CameraError, InputError
 
 CAMERA = PinholeCamera(800, 810, 310, 250, 640, 480, "front", distortions=(0.1, -0.02),
                        rotation=(0.1, 0.2, 0.3), translation=(0, 0, 3))  # fmt: skip
@@ -46,3 +46,28 @@ def test_padding_is_less_than_a_block():
 def test_images_of_another_shape_are_refused():
     with pytest.raises(CameraError, match=r"a\.npz: is of 640 x 360 pixels, and camera 'front'"):
         fit_to_size(CAMERA, (640, 360), "a.npz")
+
+
+def test_images_that_are_turned_are_called_so():
+    with pytest.raises(CameraError, match="turned by 90 degrees, so the calibration must be of"):
+        fit_to_size(CAMERA, (480, 640), "a.npz")
+
+
+def test_a_camera_of_one_person_fits_the_images_too(tmp_path):
+    CAMERA.save(tmp_path / "c.toml")
+    given = str(tmp_path / "c.toml")
+    camera, notes = resolve_camera(given, None, (320, 240), None, "clip.mp4")
+    expected = CameraRig([CAMERA]).scaled(240, 320)
+    torch.testing.assert_close(camera.matrix, expected.matrix[0])
+    assert camera.image_size == (320, 240)
+    assert "scaled from 640 x 480" in notes[0] and "undistort keypoints or images" in notes[1]
+    camera, notes = resolve_camera(given, None, (632, 470), None, "clip.mp4")
+    assert camera.image_size == (632, 470) and torch.equal(camera.matrix, CAMERA.matrix)
+    with pytest.raises(CameraError, match="images of another shape are cut"):
+        resolve_camera(given, None, (640, 360), None, "clip.mp4")
+
+
+@pytest.mark.parametrize("given", [None, "525,525,319.5,239.5"])
+def test_a_name_without_a_file_of_cameras_is_refused(given):
+    with pytest.raises(InputError, match="--camera-name chooses"):
+        resolve_camera(given, "left", (640, 480), None, "clip.mp4")

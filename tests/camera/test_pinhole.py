@@ -370,6 +370,34 @@ def test_which_of_several_cameras(tmp_path):
         save_cameras([PinholeCamera(1, 1, 0, 0, name="a")] * 2, tmp_path / "same.toml")
 
 
+MATRIX = "matrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]"
+
+
+def test_cameras_are_found_by_their_names_too(tmp_path):
+    """Anipose numbers its tables, and `name` says what the user called the camera."""
+    path = tmp_path / "anipose.toml"
+    path.write_text(
+        f'[cam_0]\nname = "left"\n{MATRIX}\n[cam_1]\nname = "right"\n{MATRIX}\n'
+        f'[cam_2]\nname = "right"\n{MATRIX}\n[cam_3]\nname = ""\n{MATRIX}\n'
+    )
+    assert PinholeCamera.load(path, "left").name == PinholeCamera.load(path, "cam_0").name == "left"
+    assert PinholeCamera.load(path, "cam_3").name == "cam_3"
+    with pytest.raises(CameraError, match=r"no 'right'; it holds cam_0 \(left\), cam_1 \(right\),"):
+        PinholeCamera.load(path, "right")
+
+
+def test_files_that_editors_of_windows_wrote(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_bytes(f"\ufeff[cam]\r\n{MATRIX}\r\n".encode())
+    assert PinholeCamera.load(path).matrix[0, 0] == 500
+
+
+@pytest.mark.parametrize("name", ["metadata", "\U000e0001 tag", "tab\t"])
+def test_odd_names_come_back(tmp_path, name):
+    PinholeCamera(525, 525, 320, 240, name=name).save(tmp_path / "camera.toml")
+    assert list(load_cameras(tmp_path / "camera.toml")) == [name]
+
+
 @pytest.mark.data
 def test_the_pose2sim_calibration():
     """The file's cameras are those of the recording made with them."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchpose.camera import CameraRig, PinholeCamera, save_cameras
-from torchpose.camera._rig import as_rig
+from torchpose.camera._rig import as_rig, undistortion_maps
 from torchpose.errors import CameraError, InputError
 
 DISTORTIONS = (-0.25, 0.08, 0.002, -0.001)
@@ -115,7 +115,13 @@ def test_undistort_moves_spots_to_where_forward_puts_them(fisheye, dtype):
 
 @pytest.mark.parametrize(
     "distortions, fisheye",
-    [((-0.27, 0.09, 0, 0, -0.015), False), ((-0.35,), False), ((0.2, -0.05), True)],
+    [
+        ((-0.27, 0.09, 0, 0, -0.015), False),
+        ((-0.35,), False),
+        ((0.2, -0.05), True),
+        ((), True),
+        ((0.0, 0.0, 0.0, 0.0), True),
+    ],
 )
 def test_undistort_points_is_the_inverse_of_opencv_out_to_the_corners(distortions, fisheye):
     camera = PinholeCamera(
@@ -133,6 +139,19 @@ def test_undistort_points_is_the_inverse_of_opencv_out_to_the_corners(distortion
     wanted = 900 * rays + torch.tensor([959.5, 539.5])
     found = CameraRig([camera]).undistort_points(pixels)[0]
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "distortions", [(-0.3,), (-0.3, 0.1, 0.001), (-0.3, 0.1, 0, 0, 0.01, 0.02)]
+)
+def test_maps_take_any_number_of_distortions(distortions):
+    camera = PinholeCamera(50, 50, 31.5, 23.5, 64, 48, distortions=distortions)
+    found = undistortion_maps(camera.matrix, camera.distortions, False, (64, 48))
+    d = np.zeros(8)
+    d[: len(distortions)] = distortions
+    K = camera.matrix.numpy()
+    wanted = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, (64, 48), cv2.CV_32FC1)
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
 def test_undistort_points_has_nothing_where_no_ray_ends():

@@ -226,6 +226,13 @@ def test_camera_comes_from_the_first_source_that_has_one(track, files, tmp_path)
     assert any("was assumed" in note for note in poses.notes)
 
 
+def test_a_camera_is_scaled_to_the_images(track, tmp_path):
+    PinholeCamera(1050, 1050, 639.5, 479.5, 1280, 960).save(tmp_path / "large.toml")
+    done, poses = track("--camera", tmp_path / "large.toml")
+    assert "scaled from 1280 x 960 pixels to the 640 x 480 pixels of" in done.out
+    torch.testing.assert_close(poses.matrix[0], torch.tensor([525.0, 0.0, 319.5]).to(poses.matrix))
+
+
 def test_distortions_are_not_applied_silently(track, tmp_path):
     PinholeCamera(525, 525, 319.5, 239.5, distortions=(0.1, 0, 0, 0)).save(tmp_path / "c.toml")
     assert "distortions are not applied" in track("--camera", tmp_path / "c.toml")[0].out
@@ -357,7 +364,11 @@ BAD_INPUT = {
     "no focal length": ([CLIP, "--camera", "0,0,320,240"], "positive focal lengths"),
     "a camera in millimetres": ([CLIP, "--camera", "4.2,4.2,3,2"], "a camera must be in pixels"),
     "no camera file": ([CLIP, "--camera", "{tmp}/no.toml"], "no such file"),
-    "camera of other images": ([CLIP, "--camera", "{tmp}/small.toml"], "320 x 240"),
+    "camera of other images": ([CLIP, "--camera", "{tmp}/wide.toml"], "640 x 360"),
+    "a camera's name alone": (
+        [CLIP, "--camera-name", "left"],
+        "one of several cameras of --camera",
+    ),
     "keypoints of another size": (["{tmp}/large.npz"], "lie outside the image of 640 x 480"),
     "confidence of a detector": ([CLIP, "--min-confidence", "0.5"], "is for videos"),
     "detector of keypoints": ([CLIP, "--detector", "no.onnx"], "is for videos"),
@@ -396,7 +407,7 @@ def bad_files(tmp_path, files):
     write_keypoints(tmp_path / "gap.npz", gap)
     headless = keypoints(names=("neck", "elbow_left", "hand_left", "hand_right"))
     write_keypoints(tmp_path / "no_head.npz", headless)
-    PinholeCamera(250, 250, 160, 120, 320, 240).save(tmp_path / "small.toml")
+    PinholeCamera(500, 500, 320, 180, 640, 360).save(tmp_path / "wide.toml")
     return {"tmp": tmp_path, "files": files}
 
 

@@ -8,7 +8,9 @@ import torch
 
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
+from torchpose.camera._projection import intrinsics
 from torchpose.cli import main
+from torchpose.cli._body_recordings import Recordings
 from torchpose.cli._track_body_output import action_text, draw, project_joints
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
@@ -155,6 +157,26 @@ def test_silhouettes_count_beside_keypoints(recorded, tmp_path):
     )  # fmt: skip
     torch.testing.assert_close(poses.joints3d, expected.joints3d)
     assert float((poses.joints3d - body.joints(states)).norm(dim=-1).mean()) < 0.08
+
+
+def test_cameras_are_scaled_to_the_videos(recorded):
+    folder = recorded[0]
+    cameras = load_cameras(folder / "cameras.toml")
+    videos = [str(folder / f"{name}.mp4") for name in cameras]
+    larger = []
+    for name, c in cameras.items():
+        fx, fy, _, cx, cy = (2 * float(e) for e in intrinsics(c.matrix))
+        pose = {"rotation": c.rotation.tolist(), "translation": c.translation.tolist()}
+        size = (2 * WIDTH, 2 * HEIGHT)
+        larger.append(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, *size, name, **pose))
+    with Recordings(videos, list(cameras.values()), 60) as same:
+        assert same.notes == []
+    with Recordings(videos, larger, 60) as scaled:
+        assert len(scaled.notes) == 3 and "front is scaled from 320 x 240" in scaled.notes[0]
+    for one, other in zip(same.views, scaled.views, strict=True):
+        torch.testing.assert_close(one.camera.matrix, other.camera.matrix)
+        torch.testing.assert_close(one.source.matrix, other.source.matrix)
+        assert one.source.image_size == other.source.image_size == (WIDTH, HEIGHT)
 
 
 def test_nobody_there_is_said(recorded, tmp_path, capsys):
@@ -381,7 +403,18 @@ def test_joints_are_drawn_where_the_lens_puts_them(fisheye):
         again = CameraRig([camera]).undistort_points(found[None])[0]
         torch.testing.assert_close(again[:2], straight, rtol=0, atol=1e-4)
         moved = (found[:2] - straight).norm(dim=-1)
-        assert bool(moved.max() > 1) == (length > 0)
+        assert bool(moved.max() > 1) == (length > 0 or fisheye)
+
+
+@pytest.mark.parametrize("distortions", [(-0.3,), (-0.25, 0.05, 0, 0, -0.005)])
+def test_joints_beside_the_image_are_not_folded_into_it(distortions):
+    camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=distortions)
+    aside = torch.linspace(0.0, 6.0, 121).double()
+    level = torch.zeros_like(aside)
+    u = project_joints(torch.stack([aside, level, level + 1], -1), camera)[:, 0]
+    there = int(u.isfinite().sum())
+    assert aside[there] > 0.8 and u[there:].isnan().all()  # where the lens still tells them apart
+    assert (u[:there].diff() > 0).all()
 
 
 def test_videos_are_not_read_past_the_last_pose(tmp_path):

@@ -171,13 +171,27 @@ def test_one_camera_is_enough(track, scene, tmp_path):
     assert "m by its bones, 1.75 m given" in done.out
 
 
-def test_cameras_without_poses_are_refused(torchpose, scene, tmp_path):
-    cameras = load_cameras(scene[0] / "cameras.toml").values()
-    save_cameras([PinholeCamera.from_matrix(c.matrix, WIDTH, HEIGHT, c.name) for c in cameras],
-                 tmp_path / "cameras.toml")  # fmt: skip
+@pytest.mark.parametrize("without", [3, 2])
+def test_cameras_without_poses_are_refused(torchpose, scene, tmp_path, without):
+    cameras = list(load_cameras(scene[0] / "cameras.toml").values())
+    for i, c in enumerate(cameras[:without]):
+        cameras[i] = PinholeCamera.from_matrix(c.matrix, WIDTH, HEIGHT, c.name)
+    save_cameras(cameras, tmp_path / "cameras.toml")
     inputs = [scene[0] / name for name in MIXED]
     done = torchpose("track-body", tmp_path / "cameras.toml", *inputs, "--out", tmp_path / "out")
-    assert done.code == 2 and "all cameras are in the same place" in done.err
+    assert done.code == 2 and "'front' and 'left' are in the same place" in done.err
+
+
+def test_cameras_are_chosen_by_their_names_too(torchpose, scene, tmp_path):
+    text = (scene[0] / "cameras.toml").read_text()
+    for i, name in enumerate(PLACES):
+        text = text.replace(f"[{name}]", f"[cam_{i}]")
+    (tmp_path / "anipose.toml").write_text(text)
+    base = ("track-body", tmp_path / "anipose.toml", scene[0] / "front.npz", *PLAIN)
+    done = torchpose(*base, "--camera-names", "front", "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    done = torchpose(*base, "--camera-names", "side", "--out", tmp_path / "out")
+    assert "it holds cam_0 (front), cam_1 (left), cam_2 (behind)" in done.err
 
 
 def test_the_body_is_drawn_into_videos(track, scene, tmp_path):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -40,6 +42,19 @@ def test_what_is_saved_is_loaded(tmp_path, frame):
     )
     torch.testing.assert_close(after.body.radii, before.body.radii)
     assert after.body.frame == frame
+
+
+@pytest.mark.parametrize("method", ["kalman", "sir"])
+def test_bones_of_kalman_may_have_adapted(tmp_path, method):
+    """Its states have the bones of the whole track, far from those of frames that no person explains."""
+    before = replace(poses(), method=method)
+    before.joints3d[0] *= 1.8
+    before.save(tmp_path / "body.npz")
+    if method == "kalman":
+        assert torch.equal(BodyTrack.load(tmp_path / "body.npz").joints3d, before.joints3d)
+    else:
+        with pytest.raises(FileFormatError, match="where state puts them"):
+            BodyTrack.load(tmp_path / "body.npz")
 
 
 def test_failures_are_told_as_in_a_pose_track():

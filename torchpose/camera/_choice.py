@@ -3,17 +3,20 @@
 A calibrated camera is fitted to the size of the images that the input has.
 """
 
+from itertools import combinations
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import intrinsics
-from torchpose.camera._rig import scale_matrix
-from torchpose.errors import CameraError
+from torchpose.camera._rig import CameraRig, is_distorted, scale_matrix
+from torchpose.errors import CameraError, InputError
 
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _LEAST_FOCAL = 10.0  # pixels
+_FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
 _SQUEEZED = 0.02  # of the ratio of the sides: images of another shape are cut, and not scaled
 
 
@@ -26,8 +29,8 @@ def resolve_camera(
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
     """Return the camera of keypoints or of a video, and notes on assumptions.
 
-    In this order: what was given; K that came with the input; its image size with f = 525/640 of the
-    longer side.
+    In this order: what was given, scaled to the input's images; K that came with the input; its image
+    size with f = 525/640 of the longer side.
 
     Args:
         given: a TOML file, or ``fx,fy,cx,cy`` for images of the input's size.
@@ -36,19 +39,24 @@ def resolve_camera(
         source: the input, for messages.
 
     Raises:
-        CameraError: no camera is known, four numbers are not what was given, its image size is not that
-            of the input, or its focal length is not one in pixels. InputError, FileFormatError: the file.
+        CameraError: no camera is known, four numbers are not what was given, its images are of another
+            shape than the input's, or its focal length is not one in pixels.
+        InputError: a name without a file of cameras, or no such file. FileFormatError: the file.
     """
+    if name is not None and (not given or _is_numbers(given)):
+        raise InputError(
+            f"--camera-name chooses one of several cameras of --camera FILE, got {name!r} "
+            + (f"with --camera {given}" if given else "without --camera")
+        )
     if given:
         camera = _of_pixels(_given_camera(given, name, size), given)
+        camera, notes = fit_to_size(camera, size, source)
         if size is not None and camera.image_size is not None and camera.image_size != size:
-            raise CameraError(
-                f"{given}: the camera is for images of {_text(camera.image_size)}, the input is "
-                f"of {_text(size)}; give the camera of the input's images"
+            camera = _of_size(camera, camera.matrix, size)  # without the padding of a codec
+        if is_distorted(camera.distortions, camera.fisheye):
+            notes += (
+                "the camera's distortions are not applied: undistort keypoints or images beforehand",
             )
-        notes: tuple[str, ...] = ()
-        if bool((camera.distortions != 0).any()):
-            notes = ("the camera's distortions are not applied: undistort keypoints beforehand",)
         return camera, notes
     if matrix is not None:
         return _of_pixels(PinholeCamera.from_matrix(matrix, *(size or (None, None))), source), ()
@@ -66,7 +74,7 @@ def resolve_camera(
 
 
 def _given_camera(given: str, name: str | None, size: tuple[int, int] | None) -> PinholeCamera:
-    if Path(given).exists() or "," not in given:
+    if not _is_numbers(given):
         return PinholeCamera.load(given, name)
     try:
         fx, fy, cx, cy = (float(part) for part in given.split(","))
@@ -75,6 +83,10 @@ def _given_camera(given: str, name: str | None, size: tuple[int, int] | None) ->
             f"--camera must be a TOML file or four numbers fx,fy,cx,cy in pixels, got {given!r}"
         ) from error
     return PinholeCamera(fx, fy, cx, cy, *(size or (None, None)))
+
+
+def _is_numbers(given: str) -> bool:
+    return "," in given and not Path(given).exists()
 
 
 def _of_pixels(camera: PinholeCamera, source: object) -> PinholeCamera:
@@ -118,17 +130,42 @@ def fit_to_size(
         return camera, ()
     sx, sy = size[0] / calibrated[0], size[1] / calibrated[1]
     if abs(sx / sy - 1) > _SQUEEZED:
+        turned = abs(size[0] * calibrated[0] / (size[1] * calibrated[1]) - 1) <= _SQUEEZED
+        why = "they are turned by 90 degrees" if turned else "images of another shape are cut"
         raise CameraError(
             f"{source}: is of {_text(size)}, and camera {camera.name!r} is calibrated for "
-            f"{_text(calibrated)}: images of another shape are cut, so the calibration must be of them"
+            f"{_text(calibrated)}: {why}, so the calibration must be of them"
         )
-    fx, fy, skew, cx, cy = map(float, intrinsics(scale_matrix(camera.matrix, sx, sy)))
-    scaled = PinholeCamera(
+    note = (
+        f"camera {camera.name} is scaled from {_text(calibrated)} to the {_text(size)} of {source}"
+    )
+    return _of_size(camera, scale_matrix(camera.matrix, sx, sy), size), (note,)
+
+
+def _of_size(camera: PinholeCamera, matrix: Tensor, size: tuple[int, int]) -> PinholeCamera:
+    """Return the camera with another matrix and image size."""
+    fx, fy, skew, cx, cy = map(float, intrinsics(matrix))
+    return PinholeCamera(
         fx, fy, cx, cy, *size, camera.name, skew=skew, distortions=camera.distortions.tolist(),
         rotation=camera.rotation.tolist(), translation=camera.translation.tolist(),
         fisheye=camera.fisheye,
     )  # fmt: skip
-    note = (
-        f"camera {camera.name} is scaled from {_text(calibrated)} to the {_text(size)} of {source}"
-    )
-    return scaled, (note,)
+
+
+def check_room(rig: CameraRig) -> None:
+    """Raise `CameraError` for cameras farther away than any room is large, and for two with one pose."""
+    far = rig.translation.norm(dim=-1)
+    if bool((far > _FARTHEST).any()):
+        raise CameraError(
+            f"cameras must be given in metres, got camera {rig.names[int(far.argmax())]!r} "
+            f"{float(far.max()):g} m from the origin; divide translations in millimetres by 1000"
+        )
+    for a, b in combinations(range(len(rig)), 2):
+        if torch.equal(rig.rotation[a], rig.rotation[b]) and torch.equal(
+            rig.translation[a], rig.translation[b]
+        ):
+            raise CameraError(
+                f"cameras {rig.names[a]!r} and {rig.names[b]!r} are in the same place with the same "
+                "rotation; expected `rotation` and `translation` of each, of a calibration of all "
+                "cameras together"
+            )

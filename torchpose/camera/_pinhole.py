@@ -150,7 +150,8 @@ class PinholeCamera(nn.Module):
 
         Args:
             path: TOML file, see `load_cameras`.
-            name: the name of the camera, as in the file; may be left out where the file holds one camera.
+            name: the name of the camera: that of its table, or else its `name`; may be left out where the
+                file holds one camera.
 
         Returns:
             The camera.
@@ -162,10 +163,11 @@ class PinholeCamera(nn.Module):
         cameras = load_cameras(path)
         if name is None and len(cameras) == 1:
             return next(iter(cameras.values()))
-        if name is None or name not in cameras:
+        found = None if name is None else camera_of_name(cameras, name)
+        if found is None:
             wanted = "a name must say which camera is meant" if name is None else f"no {name!r}"
-            raise CameraError(f"{path}: {wanted}; it holds {', '.join(sorted(cameras))}")
-        return cameras[name]
+            raise CameraError(f"{path}: {wanted}; it holds {list_names(cameras)}")
+        return found
 
     def save(self, path: str | Path) -> None:
         """Write this camera as TOML, atomically: an interrupted write leaves no partial file.
@@ -230,14 +232,18 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     from torchpose._core.reading import read_text, reading  # io imports this module
 
     expected = "a TOML camera file"
-    text = read_text(path, expected, "utf-8")
+    text = read_text(path, expected)
     with reading(path, expected):
         content = tomllib.loads(text)
         return _cameras_of(path, content)
 
 
 def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, PinholeCamera]:
-    tables = {k: v for k, v in content.items() if isinstance(v, Mapping) and k != "metadata"}
+    tables = {
+        k: v
+        for k, v in content.items()
+        if isinstance(v, Mapping) and (k != "metadata" or "matrix" in v)
+    }
     if not tables:
         raise FileFormatError(f"{path}: expected a table per camera with `matrix`, found none")
     found = {name: _camera_from_table(f"{path} [{name}]", name, t) for name, t in tables.items()}
@@ -249,6 +255,19 @@ def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, Pinho
                     f"{path} [{name}]: a pose is `rotation` and `translation`, and {missing[0]} is not there"
                 )
     return found
+
+
+def camera_of_name(cameras: Mapping[str, PinholeCamera], name: str) -> PinholeCamera | None:
+    """Return the camera whose table has a name, or else the only one that is called so; None without one."""
+    called_so = [camera for camera in cameras.values() if camera.name == name]
+    return cameras.get(name, called_so[0] if len(called_so) == 1 else None)
+
+
+def list_names(cameras: Mapping[str, PinholeCamera]) -> str:
+    """Return the names of tables in words, each with what its camera is called, if that is something else."""
+    return ", ".join(
+        key if camera.name == key else f"{key} ({camera.name})" for key, camera in cameras.items()
+    )
 
 
 def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
@@ -332,7 +351,7 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
         base = PinholeCamera.from_matrix(table["matrix"])
         fx, fy, skew, cx, cy = (float(e) for e in intrinsics(base.matrix))
         return PinholeCamera(
-            fx, fy, cx, cy, size[0], size[1], str(table.get("name", name)), skew=skew,
+            fx, fy, cx, cy, size[0], size[1], str(table.get("name") or name), skew=skew,
             distortions=table.get("distortions", ()),
             rotation=table.get("rotation", (0.0, 0.0, 0.0)),
             translation=table.get("translation", (0.0, 0.0, 0.0)),
@@ -344,7 +363,7 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
 
 def _toml_string(text: str) -> str:
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
 def _camera_to_toml(name: str, camera: PinholeCamera) -> str:

@@ -209,7 +209,7 @@ class CameraRig(nn.Module):
             points: [..., C, N, 2], pixels of the C cameras; NaN stays NaN.
 
         Returns:
-            [..., C, N, 2], pixels; the same tensor where no camera is distorted. NaN where the distortions
+            [..., C, N, 2], pixels; the same tensor where no lens distorts. NaN where the distortions
             have no inverse: no ray in front of the camera ends there.
 
         Raises:
@@ -221,7 +221,7 @@ class CameraRig(nn.Module):
                 f"points must be of {len(self)} cameras ({', '.join(self.names)}), got "
                 f"{points.shape[-3]}"
             )
-        if not bool(self.distortions.any()):
+        if not any(map(is_distorted, self.distortions, self.fisheye)):
             return points
         straight = points.clone()
         for c in range(len(self)):
@@ -264,7 +264,7 @@ class CameraRig(nn.Module):
         """Return the undistorted pixels [..., N, 2] of one camera."""
         d, K = self.distortions[camera].double().cpu(), self.matrix[camera].double().cpu()
         known = torch.isfinite(points).all(-1)
-        if not bool(d.any()) or not bool(known.any()):
+        if not is_distorted(d, self.fisheye[camera]) or not bool(known.any()):
             return points
         pixels = points[known].double().cpu()
         rays = torch.linalg.solve(K, torch.cat([pixels, torch.ones_like(pixels[:, :1])], -1).mT).mT
@@ -294,6 +294,11 @@ class CameraRig(nn.Module):
         return out > 127 if mask else out
 
 
+def is_distorted(distortions: Float[Tensor, " n"], fisheye: bool) -> bool:
+    """Return whether a lens changes anything; that of the fisheye model does without a coefficient too."""
+    return fisheye or bool(distortions.any())
+
+
 def distort_rays(
     rays: Float[Tensor, "N 2"], distortions: Float[Tensor, " n"], fisheye: bool
 ) -> Float[Tensor, "N 2"]:
@@ -301,11 +306,11 @@ def distort_rays(
 
     Args:
         rays: in front of the camera. distortions: up to 14 of OpenCV's, or 4 of its fisheye model.
-        fisheye: whether they are those. Without any that is not 0 the lens changes nothing.
+        fisheye: whether they are those.
     """
     import cv2
 
-    if not len(rays) or not bool(distortions.any()):
+    if not len(rays) or not is_distorted(distortions, fisheye):
         return rays
     there = torch.cat([rays, torch.ones_like(rays[:, :1])], -1)
     source = np.ascontiguousarray(there.double().numpy(force=True))[:, None]
@@ -327,7 +332,7 @@ def straighten_rays(
     """
     import cv2
 
-    if not len(rays) or not bool(distortions.any()):
+    if not len(rays) or not is_distorted(distortions, fisheye):
         return rays
     source = np.ascontiguousarray(rays.double().numpy(force=True))[:, None]
     d, eye = _in_full(distortions, fisheye), np.eye(3)
@@ -377,11 +382,11 @@ def undistortion_maps(
     """
     import cv2
 
-    d, K = distortions.numpy(force=True), matrix.numpy(force=True)
-    if not d.any():
+    if not is_distorted(distortions, fisheye):
         return None
+    d, K = _in_full(distortions, fisheye), matrix.double().numpy(force=True)
     if fisheye:
-        u, v = cv2.fisheye.initUndistortRectifyMap(K, d[:4], np.eye(3), K, size, cv2.CV_32FC1)
+        u, v = cv2.fisheye.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
     else:
         u, v = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
     u, v = np.asarray(u), np.asarray(v)

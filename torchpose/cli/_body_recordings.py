@@ -53,14 +53,17 @@ class Recordings:
         background: Sequence[str] | None = None,
         ignore_still: bool = False,
     ) -> None:
+        from torchpose.camera._choice import fit_to_size
         from torchpose.video._silhouettes import fit_views
 
         self.videos, self._fps, self.background = videos, fps, background or ()
         self._delays, self._ignore_still = delays or [0] * len(videos), ignore_still
         self.sources = self._open()
-        self.views = fit_views(cameras, [s.size for s in self.sources], rows)
+        sizes = [source.size for source in self.sources]
+        fitted = [fit_to_size(*given) for given in zip(cameras, sizes, videos, strict=True)]
+        self.views = fit_views([camera for camera, _ in fitted], sizes, rows)
         self.packed: list[Any] = []
-        self.notes: list[str] = []
+        self.notes: list[str] = [note for _, notes in fitted for note in notes]
 
     def __enter__(self) -> "Recordings":
         return self

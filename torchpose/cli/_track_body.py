@@ -404,24 +404,17 @@ def _check(values: dict[str, Any]) -> None:
 
 
 def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[PinholeCamera]":
-    from torchpose.camera._pinhole import load_cameras
+    from torchpose.camera._pinhole import camera_of_name, list_names, load_cameras
 
-    found = load_cameras(file)
-    names = list(found) if names is None else names
-    missing = [name for name in names if name not in found]
-    if missing or len(names) != n_inputs:
+    cameras = load_cameras(file)
+    names = list(cameras) if names is None else names
+    found = [camera_of_name(cameras, name) for name in names]
+    if None in found or len(names) != n_inputs:
         raise CameraError(
-            f"{file}: expected a camera for each of the {n_inputs} inputs, got "
-            f"{', '.join(names)}; it holds {', '.join(found)} (choose by --camera-names)"
+            f"{file}: expected a camera for each of the {n_inputs} inputs, got {', '.join(names)}; "
+            f"it holds {list_names(cameras)} (choose by --camera-names)"
         )
-    cameras = [found[name] for name in names]
-    places = {(*c.rotation.tolist(), *c.translation.tolist()) for c in cameras}
-    if len(cameras) > 1 and len(places) == 1:
-        raise CameraError(
-            f"{file}: all cameras are in the same place with the same rotation; expected `rotation` and "
-            "`translation` of each, of a calibration of all cameras together"
-        )
-    return cameras
+    return [camera for camera in found if camera is not None]
 
 
 def _models(

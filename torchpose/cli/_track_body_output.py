@@ -25,6 +25,7 @@ _OWN = (
     r"|overlay(_.+\.mp4|\.png)|report\.html"
     r"|refined_cameras\.toml"
 )
+_FOLDED = 0.01  # of a ray's length: between it and what its pixel is undistorted to
 _MOST_RUNS = 8  # of actions that are listed by their frames
 
 
@@ -180,16 +181,20 @@ def draw(
 def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
     """Return the pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied.
 
-    Points behind the camera have none: NaN.
+    Points have none, NaN, behind the camera, and where the distortions, which were fitted to the image alone,
+    fold back into it what lies far beside it.
     """
     import torch
 
-    from torchpose.camera._rig import distort_rays
+    from torchpose.camera._rig import distort_rays, straighten_rays
 
     points = joints.detach().cpu().double() @ camera.rotation_matrix.mT + camera.translation
-    rays = distort_rays(points[:, :2] / points[:, 2:], camera.distortions, camera.fisheye)
+    straight, lens = points[:, :2] / points[:, 2:], (camera.distortions, camera.fisheye)
+    rays = distort_rays(straight, *lens)
+    size = 1 + straight.norm(dim=-1, keepdim=True)
+    off = (straighten_rays(rays, *lens) - straight).norm(dim=-1, keepdim=True) / size
     pixels = rays @ camera.matrix[:2, :2].mT + camera.matrix[:2, 2]
-    return torch.where(points[:, 2:] > 0, pixels, torch.nan)
+    return torch.where((points[:, 2:] > 0) & (off < _FOLDED), pixels, torch.nan)
 
 
 def _write_strip(path: Path, strip: list[list[Any]]) -> Path:

@@ -40,7 +40,9 @@ _BODY = {
 }
 _FPS = 30.0  # of files that need a rate, where none is known
 _APART = 1e-3  # metres between joints and where the states put them
-_APART_OF = {"kalman": 0.3}  # whose joints shift, and whose bones adapt over time
+_APART_OF = {
+    "kalman": 5.0
+}  # whose bones adapt over time, by metres where keypoints are no person's
 _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no person is outside
 
 

@@ -17,6 +17,7 @@ from torchpose._core.module_state import in_own_precision
 from torchpose._core.moved import warn_of_former
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
+from torchpose.camera._choice import check_room
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
@@ -121,7 +122,8 @@ class BodyTracker(nn.Module):
 
     Raises:
         InputError: an unknown method, a model or an option that it does not use, too few particles.
-        PriorError: no such model, or one of another skeleton or frame rate. CameraError: no cameras.
+        PriorError: no such model, or one of another skeleton or frame rate.
+        CameraError: no cameras, two with the same pose, or some farther away than any room is large.
 
     Example:
         >>> import torch, torchpose
@@ -165,6 +167,8 @@ class BodyTracker(nn.Module):
         check_rate("fps", fps)
         given = {"manifold": manifold, "conditionals": conditionals, "action": action}
         given = {kind: value for kind, value in given.items() if value is not None}
+        rig = as_rig(cameras)
+        check_room(rig)
         self.by_keypoints: KeypointBodyTracker | None = None
         self.notes: tuple[str, ...] = ()
         if method == KEYPOINT_METHOD:
@@ -175,7 +179,7 @@ class BodyTracker(nn.Module):
             self.method, self.fps = method, float(fps)
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.by_keypoints = KeypointBodyTracker(
-                as_rig(cameras), fps, body=person, height=height,
+                rig, fps, body=person, height=height,
                 motion=load_body_motion(motion) if isinstance(motion, str | Path) else motion,
                 keypoint_std=keypoint_std, pixel_std=pixel_std, up=up,
             )  # fmt: skip
@@ -198,7 +202,7 @@ class BodyTracker(nn.Module):
         self.filter = make_filter(
             self.method, tracked, learnt, fps, n_particles, {**options, **noise}
         )
-        self.cameras, self.fps, self.n_particles = as_rig(cameras), float(fps), n_particles
+        self.cameras, self.fps, self.n_particles = rig, float(fps), n_particles
         self.notes = tuple(filter(None, (note for _, note in models.values())))
         # of the filter where these are the same, so that its tensors are in the state once
         self._upright = None if upright is tracked else upright

@@ -24,10 +24,10 @@ class Scene(NamedTuple):
 
 def ring(count: int, distance: float = 4.0) -> CameraRig:
     """Cameras around the origin, 1 m above the pelvis, world axes with y up."""
-    return CameraRig([_camera(0.6 + i * math.pi / 2, distance, f"c{i}") for i in range(count)])
+    return CameraRig([camera_at(0.6 + i * math.pi / 2, distance, f"c{i}") for i in range(count)])
 
 
-def _camera(angle: float, distance: float, name: str) -> PinholeCamera:
+def camera_at(angle: float, distance: float, name: str) -> PinholeCamera:
     tilt, s, c = 0.2, math.sin(angle), math.cos(angle)
     right = torch.tensor([c, 0.0, -s], dtype=torch.float64)
     ahead = -torch.tensor(

@@ -1,13 +1,23 @@
 """Delays and poses of cameras from the keypoints of a person: found, left alone, said, and refused."""
 
+import copy
 import math
+import re
 
 import pytest
 import torch
 
-from tests.whole_body.keypoints.scenes import FPS, Scene, errors, moving_body, ring
+from tests.whole_body.keypoints.scenes import (
+    FPS,
+    Scene,
+    camera_at,
+    errors,
+    moving_body,
+    ring,
+    scene,
+)
 from torchpose.camera import CameraRig
-from torchpose.errors import InputError, ShapeError
+from torchpose.errors import CameraError, InputError, ShapeError
 from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
 from torchpose.whole_body import BodyTrack, BodyTracker
 from torchpose.whole_body._keypoints.camera_bundle import CameraErrors, by_pose, corrected_pose
@@ -192,3 +202,33 @@ def test_what_cannot_be_refined_is_refused(right):
         several(keypoints=right.keypoints[None], refine="both")
     with pytest.raises(InputError, match="refine"):
         several(keypoints=right.keypoints, refine="all")
+
+
+# --- units ------------------------------------------------------------------------------------------
+
+
+def scaled(rig, factor):
+    rig = copy.copy(rig)
+    rig._buffers = {**dict(rig.named_buffers()), "translation": factor * rig.translation}
+    return rig
+
+
+@pytest.mark.parametrize("factor", [40.0, 3.28, 0.1])  # within 200 m, in feet, of no scale
+def test_cameras_in_other_units_are_refused_with_their_factor(factor):
+    given = scene(2, 10, noise=6.0)
+    tracker = BodyTracker(scaled(given.rig, factor), "kalman", fps=FPS)
+    with pytest.raises(CameraError, match="in metres, and as they are given") as told:
+        tracker(keypoints=given.keypoints)
+    found = float(re.search(r"about (\S+) times", str(told.value))[1])
+    assert found == pytest.approx(factor, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "height, distance, apart", [(0.65, 4.0, 1.5), (2.15, 4.0, 1.5), (1.7, 4.0, 0.01)]
+)
+def test_small_and_tall_people_and_cameras_side_by_side_are_in_metres(height, distance, apart):
+    rig = CameraRig([camera_at(0.6 + i * apart, distance, f"c{i}") for i in range(2)])
+    pixels = rig(moving_body(6, height)).pixels
+    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).to(pixels)
+    tracker = BodyTracker(rig, "kalman", fps=FPS)
+    assert len(tracker(keypoints=pixels + 3 * noise)) == 6

@@ -34,6 +34,7 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     details_of_cameras,
     refine_cameras,
 )
+from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note, notes_of
 from torchpose.whole_body._keypoints.keypoint_tracker import (
@@ -57,7 +58,6 @@ _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
 _LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
-_FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
 
 
 class KeypointBodyTracker(nn.Module):
@@ -71,7 +71,7 @@ class KeypointBodyTracker(nn.Module):
         up: "y" or "z", the axis of the world that points up, if it is known.
 
     Raises:
-        InputError: values out of range. CameraError: cameras farther away than any room is large.
+        InputError: values out of range.
     """
 
     def __init__(
@@ -94,12 +94,6 @@ class KeypointBodyTracker(nn.Module):
             keypoint_std = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
         self.keypoint_std = check_positive("keypoint_std", keypoint_std)
         self.pixel_std = check_positive("pixel_std", PIXEL_STD if pixel_std is None else pixel_std)
-        far = rig.translation.norm(dim=-1)
-        if bool((far > _FARTHEST).any()):
-            raise CameraError(
-                f"cameras must be given in metres, got camera {rig.names[int(far.argmax())]!r} "
-                f"{float(far.max()):g} m from the origin; divide translations in millimetres by 1000"
-            )
         motion = load_body_motion("whole-body") if motion is None else motion
         if body is not None:
             motion = with_body(motion, body)
@@ -139,6 +133,7 @@ class KeypointBodyTracker(nn.Module):
         single = keypoints.ndim == 4
         if single:
             frames = frames.map(lambda value: value[None])
+        check_units(self.tracker.filter.maps, frames, self.tracker.filter.motion)
         begun = self.first_frames(frames)
         if refine != "none":
             frames = frames.map(lambda value: value[:, begun[0] :])

@@ -52,7 +52,8 @@ def notes_of(
         if astray > _DISAGREES:
             notes.append(
                 f"{100 * astray:.0f} % of the keypoints of camera {name} do not agree with the body; check "
-                "its calibration, its delay against the others, and whether its video is mirrored"
+                "its calibration, whether that is of images of the keypoints' size, its delay against the "
+                "others, and whether its video is mirrored"
             )
         swapped = float((exchanged[:, c] > 0.5).all(-1)[there[:, c].any(-1)].double().mean())
         if swapped > _MIRRORED:
