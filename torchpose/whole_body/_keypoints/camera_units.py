@@ -14,8 +14,6 @@ from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
 
-__all__ = ["check_units"]
-
 _FRAMES = 50  # of a sequence, at most, that are looked at
 _LEAST_BONES = 20  # in all images, that tell a factor
 _AGREED = 0.5  # share of the joints that two cameras see, on which they have to agree
