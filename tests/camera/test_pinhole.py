@@ -339,6 +339,11 @@ def test_one_camera_needs_no_name(tmp_path):
         ("[cam]\nmatrix = [[1, 0, 1], [0, 1, 1]]", CameraError, "shape"),
         ("[cam]\nmatrix = 'K'", CameraError, "3 x 3"),
         ("[cam]\nmatrix = [[1,0,1],[0,1,1],[0,0,1]]\nsize = 3", CameraError, "size"),
+        (
+            "[cam]\nmatrix = [[1,0,1],[0,1,1],[0,0,1]]\ndistortion = [0.1]",
+            CameraError,
+            "expected `distortions`, got `distortion`",
+        ),
         ("[cam]\nmatrix = [[1,0,1],[0,1,1],[0,0,1]]\nrotation = [1]", CameraError, "rotation"),
     ],
 )

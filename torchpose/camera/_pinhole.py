@@ -7,6 +7,7 @@ Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions 
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
@@ -29,6 +30,8 @@ from torchpose.math._rotations import (
 _FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
 _LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none
 _LARGEST_SIDE = 100_000  # pixels of an image
+_KEYS = ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye")
+_ALIKE = 0.8  # of two keys, of which one is the other misspelt
 FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a webcam
 
 
@@ -343,6 +346,7 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
     if "matrix" not in table:
         raise CameraError(f"{where}: a camera needs `matrix` (3 x 3, pixels), got {sorted(table)}")
     size = table.get("size", (None, None))
+    _check_keys(where, table)
     try:
         if not isinstance(size, Sequence) or len(size) != 2:
             raise CameraError(f"size must be [width, height], got {size!r:.60}")
@@ -359,6 +363,14 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
         )  # fmt: skip
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
+
+
+def _check_keys(where: str, table: Mapping[str, Any]) -> None:
+    """Raise `CameraError` for a key that is misspelt: what it says would not count."""
+    for key in table:
+        meant = get_close_matches(key.lower(), _KEYS, 1, _ALIKE)
+        if key not in _KEYS and meant:
+            raise CameraError(f"{where}: expected `{meant[0]}`, got `{key}`")
 
 
 def _toml_string(text: str) -> str:
