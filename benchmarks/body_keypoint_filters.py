@@ -20,6 +20,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
+from benchmarks._data import data_files
 from benchmarks.bend.occlusion import SIDE
 from benchmarks.bodies.clips import place_cameras
 from benchmarks.bodies.views import Conditions, body_of, view_of
@@ -99,7 +100,7 @@ def clips_of(data: Path, frames: int) -> Iterator[tuple[str, MocapClip, list[Moc
         for name in names:
             (clip,) = read_mocap(data / folder / f"{name}.npz", fps=_FPS)
             first = max(0, (len(clip) - frames) // 2)
-            paths = sorted((data / folder).glob(f"{BODIES[name[:3]]}.npz"))[:1]
+            paths = data_files(data / folder, f"{BODIES[name[:3]]}.npz")[:1]
             others = [one for path in paths for one in read_mocap(path, fps=_FPS)]
             yield folder, clip.cut(first, first + frames), [one.cut(0, frames) for one in others]
 

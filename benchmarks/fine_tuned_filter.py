@@ -20,7 +20,8 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._command import OneOf, run_command
-from benchmarks._upper_body import MADE_WITH, data_folder, plain_prior, score
+from benchmarks._data import data_files, data_folder
+from benchmarks._upper_body import MADE_WITH, plain_prior, score
 from benchmarks.engine import Experiment, Grid, Results
 from benchmarks.speed._timing import machine_line, markdown_table
 from torchpose._core.files import atomic_path, check_output_folder
@@ -96,7 +97,7 @@ def error(prior: UpperBodyPrior, test: Trials) -> float:
 
 def read_split(data: Path, split: str, effort: Effort) -> Split:
     """Return the recordings of a split."""
-    files = sorted(data_folder(data, "kinect_utd_mhad").glob("s0[1-6]_*.npz"))
+    files = data_files(data_folder(data, "kinect_utd_mhad"), "s0[1-6]_*.npz")
     recordings = read_recordings(files[:: effort.every_file])
     held_out = [r for r in recordings if r.person in SPLITS[split]][:: effort.every_tracked]
     poses = [centred_on_neck(r.upper_body().joints) for r in held_out]

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
 from benchmarks._command import run_command
+from benchmarks._data import data_folder
 from benchmarks._table_file import TableFile
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -351,7 +352,7 @@ def main(
         quick: the beginning of one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     names = CLIPS[:1] if quick else CLIPS
     clips, heavy = ([read_clip(folder, n, m) for n in names] for m in (1, 2))
     if quick:

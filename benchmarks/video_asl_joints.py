@@ -19,6 +19,7 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
 from benchmarks._command import run_command
+from benchmarks._data import data_folder
 from benchmarks._table_file import TableFile
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
@@ -229,7 +230,7 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     clips = [read_clip(folder, name) for name in (CLIPS[:1] if quick else CLIPS)]
     fitted = load_prior(prior)
     methods = {

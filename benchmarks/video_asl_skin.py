@@ -24,6 +24,7 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
 from benchmarks._command import run_command
+from benchmarks._data import data_folder
 from benchmarks._table_file import TableFile
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose.measure import SkinMixtureModel
@@ -82,7 +83,7 @@ def main(*, data: Path, quick: bool = False, out: TableFile | None = None) -> No
         out: file for the same as Markdown, or a folder.
     """
     torch.set_num_threads(1)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     clips = CLIPS[:1] if quick else CLIPS
     every = 10 if quick else 3
     areas: dict[str, list[float]] = {name: [] for name in MODELS}

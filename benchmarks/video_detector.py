@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
+from benchmarks._data import data_files, data_folder
 from benchmarks._table_file import TableFile
 from benchmarks.hand_network.clips import BELOW, BURN_IN, LOWEST, SEEN, UNSEEN
 from torchpose import VideoTracker
@@ -125,8 +126,8 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    folder = data / "video_people" if (data / "video_people").is_dir() else data
-    references = sorted(folder.glob("*_mediapipe_pose1.npz"))[: 1 if quick else None]
+    folder = data_folder(data, "video_people")
+    references = data_files(folder, "*_mediapipe_pose1.npz")[: 1 if quick else None]
     fitted = load_prior(prior)
     report = Report("Keypoints of a detector in video of strangers")
     table = report.table("clips", "By clip: shares, and medians in widths of the shoulders", COLUMNS,

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks._command import OneOf, run_command
+from benchmarks._data import data_files
 from benchmarks._table_file import TableFile
 from benchmarks.hand_network.clips import PEOPLE, SIGNERS
 from torchpose._core.images import Image
@@ -180,7 +181,7 @@ def main(
     """
     torch.set_num_threads(threads)
     folders = ((data / "video_people", PEOPLE), (data / "video_asl", SIGNERS))
-    clips = [next(folder.glob(f"{name}.m*")) for folder, names in folders for name in names]
+    clips = [data_files(folder, f"{name}.m*")[0] for folder, names in folders for name in names]
     changes = {name: CHANGES[name] for name in only or CHANGES}
     most = MOST
     if quick:
