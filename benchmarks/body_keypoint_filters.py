@@ -21,12 +21,13 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
 from benchmarks._data import data_files
+from benchmarks._table_file import save_text
 from benchmarks.bend.occlusion import SIDE
 from benchmarks.bodies.clips import place_cameras
 from benchmarks.bodies.views import Conditions, body_of, view_of
 from benchmarks.keypoint_bodies.clips import MHAD, WALKS, detect
 from torchpose import BodyTracker
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose.body import Body
 from torchpose.camera import CameraRig
 from torchpose.errors import TorchposeError
@@ -219,8 +220,7 @@ def _write(
         name = method if given == "-" else f"{method}, {given}"
         table.add(name, [row.get(column) for column in COLUMNS])
     print(report.summary())
-    with atomic_path(out / "summary-keypoint-filters.md") as path:
-        path.write_text(table.to_markdown() + "\n", encoding="utf-8")
+    save_text(out / "summary-keypoint-filters.md", table.to_markdown() + "\n")
 
 
 def _place(key: tuple[str, str]) -> tuple[int, int]:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.hand_network.clips import BURN_IN, Clip, found_hands, read_clips
 from torchpose._core.reading import read_npz
 from torchpose.evaluation import Report
@@ -151,8 +151,7 @@ def main(
     total = [float(values[:, 0].sum()), *shares.tolist(), *counts.tolist()]
     table.add("mean of clips; sums of hands", total)
     print(table.to_markdown())
-    if out:
-        out.write_text(table.to_markdown() + "\n")
+    save_text(out, table.to_markdown() + "\n")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import torch
 from benchmarks._asl import CLIPS, SIZE, read_clip
 from benchmarks._command import run_command
 from benchmarks._data import data_files
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from torchpose.camera import PinholeCamera
 from torchpose.measure import HeadNeck
 from torchpose.measure._face import FaceTracker
@@ -52,8 +52,7 @@ def main(
     tables = [silhouettes(data / "utd_mhad_silhouettes", quick), elbows(data / "video_asl", quick)]
     text = "\n\n".join(tables) + "\n"
     print(text, end="")
-    if out:
-        out.write_text(text, encoding="utf-8")
+    save_text(out, text)
 
 
 def silhouettes(folder: Path, quick: bool) -> str:

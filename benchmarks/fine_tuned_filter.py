@@ -21,10 +21,11 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import OneOf, run_command
 from benchmarks._data import data_files, data_folder
+from benchmarks._table_file import save_text
 from benchmarks._upper_body import MADE_WITH, plain_prior, score
 from benchmarks.engine import Experiment, Grid, Results
 from benchmarks.speed._timing import machine_line, markdown_table
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose.evaluation._trials import CAMERA, Trials, centred_on_neck, make_test_set, track
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import UpperBodyRecipe
@@ -184,8 +185,7 @@ def main(
     text = table(TUNING.run({"": grid}, seeds, out, progress=True, title="splits"))
     note = f"Mean and standard deviation over {len(seeds)} seeds."
     print(f"{text}\n\n{note}\n\n{machine_line(threads)}")
-    with atomic_path(out / "fine-tuned.md") as temporary:
-        temporary.write_text(f"{text}\n\n{note}\n", encoding="utf-8")
+    save_text(out / "fine-tuned.md", f"{text}\n\n{note}\n")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from torch import Tensor
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
 from benchmarks._command import run_command
 from benchmarks._data import data_folder
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
 from torchpose.metrics import jitter, joint_errors, joint_errors_3d
@@ -379,8 +379,7 @@ def main(
         "camera": "f = 525 px (assumed), 640x480, 30 fps",
     }
     print(report.summary())
-    if out is not None:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -34,9 +34,10 @@ from benchmarks._depth_silhouettes import (
     part_means,
     seeded,
 )
+from benchmarks._table_file import save_text
 from benchmarks.bodies.tracking import PARTS
 from benchmarks.silhouette.filters import METHODS
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose._core.reading import read_npz
 from torchpose.body import BODY_15, Body, JointLimits, body_joints, fit_body, fit_state
 from torchpose.camera import CameraRig, load_cameras
@@ -279,8 +280,7 @@ def main(
     if only != "four":
         report_one(report, data, seeds, actions, out)
     print(report.summary())
-    with atomic_path(out / "real-silhouettes.md") as path:
-        path.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out / "real-silhouettes.md", report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from torch import Tensor
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
 from benchmarks._command import run_command
 from benchmarks._data import data_folder
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -262,8 +262,7 @@ def main(
         "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
     }
     print(report.summary())
-    if out:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 if __name__ == "__main__":

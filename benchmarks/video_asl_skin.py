@@ -25,7 +25,7 @@ from torch import Tensor
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
 from benchmarks._command import run_command
 from benchmarks._data import data_folder
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose.measure import SkinMixtureModel
 from torchpose.measure._face import FaceTracker
@@ -102,8 +102,7 @@ def main(*, data: Path, quick: bool = False, out: TableFile | None = None) -> No
     text = markdown_table(["area under the curve", *clips, "mean", "ms a frame"], rows)
     text += f"\n\n{processor_model()}, one thread, median of CPU times at 160 x 120, Lab given.\n"
     print(text, end="")
-    if out is not None:
-        out.write_text(text, encoding="utf-8")
+    save_text(out, text)
 
 
 def read_frames(folder: Path, name: str, every: int) -> Iterator[Frame]:

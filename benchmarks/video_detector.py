@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchmarks._command import run_command
 from benchmarks._data import data_files, data_folder
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.hand_network.clips import BELOW, BURN_IN, LOWEST, SEEN, UNSEEN
 from torchpose import VideoTracker
 from torchpose.camera import PinholeCamera
@@ -144,8 +144,7 @@ def main(
               [mean[0], invented, *middle[2:4], mean[4]])  # fmt: skip
     report.settings = {"detector": detector or "none", "prior": fitted.info.name}
     print(report.summary())
-    if out is not None:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 
 THREAD_VARIABLES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
 
@@ -258,6 +258,4 @@ class Report:
         if limits is not None:
             self.add(limits_line(limits))
         self.add(machine_line(self.threads, packages))
-        if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text("\n\n".join(self.parts) + "\n", encoding="utf-8")
+        save_text(self.out, "\n\n".join(self.parts) + "\n")
