@@ -19,6 +19,10 @@ __all__ = ["BENCHMARKS", "PROTOCOLS", "Protocol", "build", "checked_data", "exec
 Data = Literal["folder", "recordings", "mocap"]
 _COMMON = ("data", "out", "seed", "progress", "prior")
 _MOVED = "earlier-*/*"
+_METAVARS = {
+    "added": "[DIR,...]", "compare": "[NAME=MODULE.FUNCTION,...]", "fits": "DIR", "more": "[DIR,...]",
+    "out": "DIR", "part": "cross|added|both", "prior": "NAME|FILE", "tested": "[PERSON,...]",
+}  # fmt: skip
 _EXAMPLES: dict[Data, str] = {
     "folder": "--data data/",
     "recordings": "mine/ more/",
@@ -153,8 +157,7 @@ def build(command: str, protocol: Protocol, program: str = "torchpose") -> Argum
             "score this prior, fitted on other persons, instead of fitting one"
         )
         common.append(Option("prior", "prior", str, None, text))
-    metavars = {"out": "DIR", "prior": "NAME|FILE"}
-    add_options(parser, [*common[:2], *protocol.options, *common[2:]], metavars=metavars)
+    add_options(parser, [*common[:2], *protocol.options, *common[2:]], metavars=_METAVARS)
     return parser
 
 

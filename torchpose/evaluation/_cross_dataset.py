@@ -126,7 +126,7 @@ def run(
         out: folder for the results.
         seed: the seed of priors, noise and made-up joints. progress: whether to show bars.
         quick: small priors and few sequences, to see that all of it works.
-        part: the part to run: "cross", "added" (motion capture for training) or "both".
+        part: the part to run: "cross", "added" (motion capture for training) or "both" (default).
         tested: persons whom no prior of their own data set sees; by default the last quarter of a data
             set.
         added: folders of motion capture for the second part, with shoulders, elbows, wrists and hips;
@@ -137,7 +137,8 @@ def run(
         mocap_share: the largest number of frames of motion capture that are added, as a multiple of the
             others'.
         every: track only each n-th sequence of a person. workers: the number of processes.
-        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
+        fits: the folder of fitted priors, to share them with other protocols; by default that of
+            the results.
         recipe: fits the priors.
 
     Raises:

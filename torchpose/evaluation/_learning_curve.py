@@ -88,9 +88,9 @@ def run(
         window_components: the number of Gaussians per arm over windows; by default that of the recipe.
         window_samples: the number of training windows; by default that of the recipe.
         every: track only each n-th sequence of a person. workers: the number of processes.
-        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
-        compare: other recipes to draw beside `torchpose.learning._recipes.fit_kinect_prior`, each as
-            NAME=module.function.
+        fits: the folder of fitted priors, to share them with other protocols; by default that of
+            the results.
+        compare: other recipes to draw beside the one of the shipped priors, each as NAME=module.function.
         recipes: names and functions, instead of all that.
 
     Raises:
