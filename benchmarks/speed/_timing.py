@@ -245,6 +245,13 @@ class Report:
         print(text, end="\n\n", flush=True)
         self.parts.append(text)
 
+    def leave_out(self, peer: str, error: ImportError) -> None:
+        """Say that the rows of a peer are left out, and how it is installed."""
+        self.add(
+            f"{peer} cannot be imported ({error}): its rows are left out. benchmarks/README.md says how to "
+            "install what torchpose is compared with."
+        )
+
     def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         """Print and keep a Markdown table."""
         self.add(markdown_table(header, rows))

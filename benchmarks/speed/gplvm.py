@@ -163,7 +163,7 @@ def make_methods(
             methods += gpytorch_methods(manifold, z, dtype)
     except ImportError as error:
         if not quiet:
-            report.add(f"gpytorch cannot be imported ({error}): its rows are left out.")
+            report.leave_out("gpytorch", error)
     return methods
 
 

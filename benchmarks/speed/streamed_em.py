@@ -231,7 +231,7 @@ def peer_methods(problem: Problem, report: Report) -> Iterator[Method]:
         try:
             yield make(problem)
         except ImportError as error:
-            report.add(f"{name} cannot be imported ({error}): its row is left out.")
+            report.leave_out(name, error)
 
 
 def streamed_fit(problem: Problem, dtype: torch.dtype) -> Method:
