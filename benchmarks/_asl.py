@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose._core.reading import read_npz
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._mediapipe_landmarks import derive_joints
@@ -41,11 +41,11 @@ class Clip(NamedTuple):
 
 def read_clip(folder: Path, name: str, model: int = 1) -> Clip:
     """Return MediaPipe's landmarks of a clip, those of its full (1) or heavy (2) model."""
-    with np.load(folder / f"{name}_mediapipe_pose{model}.npz") as arrays:
-        names = [str(n) for n in arrays["names"]]
-        points = torch.from_numpy(arrays["joints2d"]).double()
-        points3d = torch.from_numpy(arrays["joints3d"]).double()
-        visibility = torch.from_numpy(arrays["visibility"]).double()
+    arrays = read_npz(folder / f"{name}_mediapipe_pose{model}.npz")
+    names = [str(n) for n in arrays["names"]]
+    points = torch.from_numpy(arrays["joints2d"]).double()
+    points3d = torch.from_numpy(arrays["joints3d"]).double()
+    visibility = torch.from_numpy(arrays["visibility"]).double()
     points, seen, all_names = derive_joints(points, visibility, names)
     points3d, _, _ = derive_joints(points3d, None, names)
     if seen is None:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._data import data_files
 from benchmarks.bodies.tracking import PARTS
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, body_joints
@@ -85,14 +86,15 @@ def mean_of(found: Sequence[Tensor], truth: Tensor, centred: bool) -> list[float
 
 def kinect(folder: Path, person: str, action: str, trials: str) -> Iterator[Tensor]:
     """Yield the recorded joints [T, 15, 3] of a person's trials, in right-handed axes of the room, y up."""
-    for path in sorted((folder / "kinect_utd_mhad").glob(f"{person}_a*_{action}_t[{trials}].npz")):
+    pattern = f"{person}_a*_{action}_t[{trials}].npz"
+    for path in data_files(folder / "kinect_utd_mhad", pattern):
         with np.load(path) as z:
             yield body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
 
 
 def one_view(folder: Path, person: str, action: str) -> Filmed:
     """Return the segmented depth of trial 1 and its skeleton, shifted by the lag that the set gives."""
-    path = next((folder / "utd_mhad_silhouettes").glob(f"{person}_a*_{action}_t1.npz"))
+    (path, *_) = data_files(folder / "utd_mhad_silhouettes", f"{person}_a*_{action}_t1.npz")
     with np.load(path) as z:
         shape = z["sil_shape"]
         masks = np.unpackbits(z["sil_packed"], axis=-1)[..., : shape[2]].astype(bool)

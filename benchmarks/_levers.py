@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks._upper_body import MADE_WITH, data_folder, score, trials_of
+from benchmarks._data import data_files, data_folder
+from benchmarks._upper_body import MADE_WITH, score, trials_of
 from benchmarks.engine import kept_prior, kept_runs, source_hash
 from torchpose.camera import ViewRange
 from torchpose.evaluation._trials import CAMERA, MEASURED, Estimate, Trials, settings_hash
@@ -112,9 +113,7 @@ def read_persons(data: Path, size: Size) -> Persons:
 
 
 def _files(folder: Path, persons: Sequence[str]) -> list[Path]:
-    return [
-        path for person in persons for path in sorted(folder.glob(f"s{int(person[1:]):02d}_*.npz"))
-    ]
+    return data_files(folder, *(f"s{int(person[1:]):02d}_*.npz" for person in persons))
 
 
 class Measured(NamedTuple):

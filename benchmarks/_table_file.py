@@ -1,10 +1,11 @@
-"""Take a file or a folder as the `--out` of a script that writes one table."""
+"""Take a file or a folder as the `--out` of a script that writes one table, and write it."""
 
 import os
 import sys
 from pathlib import Path
 from typing import Annotated
 
+from torchpose._core.files import atomic_path
 from torchpose.errors import InputError
 
 
@@ -32,6 +33,13 @@ def table_file(given: str | Path) -> Path:
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise InputError(f"expected a file or a folder that can be written, got {given}")
     return path
+
+
+def save_text(path: Path | None, text: str) -> None:
+    """Write a text to a file, the whole of it or none; where there is no file, nothing is written."""
+    if path is not None:
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
 
 TableFile = Annotated[Path, table_file]

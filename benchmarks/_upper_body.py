@@ -13,7 +13,6 @@ from torch.nn import Module
 from benchmarks import bones
 from benchmarks.engine import Experiment
 from torchpose.camera import PinholeCamera, project, sample_viewpoints
-from torchpose.errors import InputError
 from torchpose.evaluation._trials import (
     CAMERA,
     Estimate,
@@ -96,19 +95,6 @@ def with_bones(data: Path, persons: Sequence[str]) -> dict[str, Any] | None:
     if not all((data / name).exists() for name in bones.SETS):
         return None
     return {"method": "multiple-model", "arms": bones.fit_without(data, None, persons)}
-
-
-def data_folder(data: str | Path, name: str) -> Path:
-    """Return `data` itself, or the folder `name` in it.
-
-    Raises:
-        InputError: no such folder.
-    """
-    data = Path(data)
-    folder = data / name if (data / name).is_dir() else data
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the one that holds {name} with --data")
-    return folder
 
 
 def trials_of(recordings: Sequence[Recording], seed: int = 0, **options: Any) -> Trials:

@@ -20,12 +20,14 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
+from benchmarks._data import data_files
+from benchmarks._table_file import save_text
 from benchmarks.bend.occlusion import SIDE
 from benchmarks.bodies.clips import place_cameras
 from benchmarks.bodies.views import Conditions, body_of, view_of
 from benchmarks.keypoint_bodies.clips import MHAD, WALKS, detect
 from torchpose import BodyTracker
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose.body import Body
 from torchpose.camera import CameraRig
 from torchpose.errors import TorchposeError
@@ -99,7 +101,7 @@ def clips_of(data: Path, frames: int) -> Iterator[tuple[str, MocapClip, list[Moc
         for name in names:
             (clip,) = read_mocap(data / folder / f"{name}.npz", fps=_FPS)
             first = max(0, (len(clip) - frames) // 2)
-            paths = sorted((data / folder).glob(f"{BODIES[name[:3]]}.npz"))[:1]
+            paths = data_files(data / folder, f"{BODIES[name[:3]]}.npz")[:1]
             others = [one for path in paths for one in read_mocap(path, fps=_FPS)]
             yield folder, clip.cut(first, first + frames), [one.cut(0, frames) for one in others]
 
@@ -218,8 +220,7 @@ def _write(
         name = method if given == "-" else f"{method}, {given}"
         table.add(name, [row.get(column) for column in COLUMNS])
     print(report.summary())
-    with atomic_path(out / "summary-keypoint-filters.md") as path:
-        path.write_text(table.to_markdown() + "\n", encoding="utf-8")
+    save_text(out / "summary-keypoint-filters.md", table.to_markdown() + "\n")
 
 
 def _place(key: tuple[str, str]) -> tuple[int, int]:

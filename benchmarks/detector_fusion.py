@@ -16,13 +16,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.hand_network.clips import BURN_IN, Clip, found_hands, read_clips
+from torchpose._core.reading import read_npz
 from torchpose.evaluation import Report
 from torchpose.io import read_keypoints
 from torchpose.skeleton._joint_sets import canonical_names
@@ -109,8 +109,8 @@ def score(ways: dict[str, Hands], truth: Tensor, width: float) -> list[float] | 
 
 def true_hands(clip: Clip) -> Tensor:
     """Return the centres of both hands by MediaPipe's model of hands, NaN where it has none [T, 2, 2]."""
-    with np.load(clip.path.parent / f"{clip.name}_mediapipe_hands.npz") as file:
-        return torch.from_numpy(file["centre2d"]).double()
+    arrays = read_npz(clip.path.parent / f"{clip.name}_mediapipe_hands.npz")
+    return torch.from_numpy(arrays["centre2d"]).double()
 
 
 def main(
@@ -151,8 +151,7 @@ def main(
     total = [float(values[:, 0].sum()), *shares.tolist(), *counts.tolist()]
     table.add("mean of clips; sums of hands", total)
     print(table.to_markdown())
-    if out:
-        out.write_text(table.to_markdown() + "\n")
+    save_text(out, table.to_markdown() + "\n")
 
 
 if __name__ == "__main__":

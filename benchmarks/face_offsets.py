@@ -18,7 +18,8 @@ import torch
 
 from benchmarks._asl import CLIPS, SIZE, read_clip
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._data import data_files
+from benchmarks._table_file import TableFile, save_text
 from torchpose.camera import PinholeCamera
 from torchpose.measure import HeadNeck
 from torchpose.measure._face import FaceTracker
@@ -51,14 +52,13 @@ def main(
     tables = [silhouettes(data / "utd_mhad_silhouettes", quick), elbows(data / "video_asl", quick)]
     text = "\n\n".join(tables) + "\n"
     print(text, end="")
-    if out:
-        out.write_text(text, encoding="utf-8")
+    save_text(out, text)
 
 
 def silhouettes(folder: Path, quick: bool) -> str:
     """Return the table of crown, narrowest row, neck joint and shoulders, metres from the head joint."""
     by_person: dict[str, list[list[float]]] = {}
-    for path in sorted(folder.glob("s01_*.npz" if quick else "s*.npz"))[: 4 if quick else None]:
+    for path in data_files(folder, "s01_*.npz" if quick else "s*.npz")[: 4 if quick else None]:
         by_person.setdefault(path.name[:3], []).extend(_heads(path))
     rows = {person: np.nanmedian(np.array(v), 0) for person, v in by_person.items() if v}
     rows["mean"] = np.mean(list(rows.values()), 0)

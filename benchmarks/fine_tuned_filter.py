@@ -20,10 +20,12 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._command import OneOf, run_command
-from benchmarks._upper_body import MADE_WITH, data_folder, plain_prior, score
+from benchmarks._data import data_files, data_folder
+from benchmarks._table_file import save_text
+from benchmarks._upper_body import MADE_WITH, plain_prior, score
 from benchmarks.engine import Experiment, Grid, Results
 from benchmarks.speed._timing import machine_line, markdown_table
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose.evaluation._trials import CAMERA, Trials, centred_on_neck, make_test_set, track
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import UpperBodyRecipe
@@ -96,7 +98,7 @@ def error(prior: UpperBodyPrior, test: Trials) -> float:
 
 def read_split(data: Path, split: str, effort: Effort) -> Split:
     """Return the recordings of a split."""
-    files = sorted(data_folder(data, "kinect_utd_mhad").glob("s0[1-6]_*.npz"))
+    files = data_files(data_folder(data, "kinect_utd_mhad"), "s0[1-6]_*.npz")
     recordings = read_recordings(files[:: effort.every_file])
     held_out = [r for r in recordings if r.person in SPLITS[split]][:: effort.every_tracked]
     poses = [centred_on_neck(r.upper_body().joints) for r in held_out]
@@ -183,8 +185,7 @@ def main(
     text = table(TUNING.run({"": grid}, seeds, out, progress=True, title="splits"))
     note = f"Mean and standard deviation over {len(seeds)} seeds."
     print(f"{text}\n\n{note}\n\n{machine_line(threads)}")
-    with atomic_path(out / "fine-tuned.md") as temporary:
-        temporary.write_text(f"{text}\n\n{note}\n", encoding="utf-8")
+    save_text(out / "fine-tuned.md", f"{text}\n\n{note}\n")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks._upper_body import score
 from benchmarks.ub_people import TEST_PERSONS, people, sway
 from torchpose.camera import PinholeCamera
@@ -68,8 +68,7 @@ def main(
             lines.append(f"| {' | '.join(row)} |")
     text = "\n".join([*lines, "", f"{note(fitted, {r.person_id for r in tested})}\n"])
     print(text, end="")
-    if out is not None:
-        out.write_text(text, encoding="utf-8")
+    save_text(out, text)
 
 
 def errors(

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._data import data_folder
+from benchmarks._table_file import TableFile, save_text
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
 from torchpose.metrics import jitter, joint_errors, joint_errors_3d
@@ -351,7 +352,7 @@ def main(
         quick: the beginning of one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     names = CLIPS[:1] if quick else CLIPS
     clips, heavy = ([read_clip(folder, n, m) for n in names] for m in (1, 2))
     if quick:
@@ -378,8 +379,7 @@ def main(
         "camera": "f = 525 px (assumed), 640x480, 30 fps",
     }
     print(report.summary())
-    if out is not None:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -24,11 +24,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-import cv2
-import mediapipe
 import numpy as np
 
+try:
+    import cv2
+    import mediapipe
+except ImportError:
+    mediapipe = None
+
 MODELS = ("lite", "full", "heavy")
+RELEASE = "0.10.21"
 
 
 def main() -> int:
@@ -43,6 +48,14 @@ def main() -> int:
     args = parser.parse_args()
     if args.out is None and not args.time:
         parser.error("give --out FILE, --time, or both")
+    if not args.video.is_file():
+        parser.error(f"{args.video}: no such video file")
+    if args.out is not None and (args.out.suffix != ".npz" or not args.out.parent.is_dir()):
+        parser.error(
+            f"--out {args.out}: expected a name that ends in .npz, in a folder that is there"
+        )
+    if not hasattr(mediapipe, "solutions"):
+        parser.error(f"needs an environment with MediaPipe: pip install mediapipe=={RELEASE}")
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[: args.threads]))
     runs = [detect(args.video, args.complexity) for _ in range(max(1, args.repeat))]
@@ -51,7 +64,7 @@ def main() -> int:
         print(f"{args.video}: no frame could be decoded", file=sys.stderr)
         return 1
     if args.out is not None:
-        np.savez_compressed(args.out, **arrays)
+        save(args.out, arrays)
         seen = int((arrays["visibility"] > 0).any(1).sum())
         print(f"{args.out}: {len(arrays['joints2d'])} frames, a person in {seen}")
     if args.time:
@@ -90,6 +103,17 @@ def detect(video: Path, complexity: int) -> tuple[dict[str, Any], list[float], l
         "model": f"mediapipe {mediapipe.__version__} pose, {MODELS[complexity]}",
     }
     return arrays, decoding, detecting
+
+
+def save(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an .npz file, the whole of it or none."""
+    part = path.with_name(f"{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def as_row(found: Any, n_joints: int, size: list[int]) -> list[tuple[float, ...]]:

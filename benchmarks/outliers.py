@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._upper_body import Tracker, data_folder, score, trials_of, with_bones
+from benchmarks._data import data_folder
+from benchmarks._upper_body import Tracker, score, trials_of, with_bones
 from benchmarks.ub_people import TEST_PERSONS, TRAIN_PERSONS
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report

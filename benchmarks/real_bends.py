@@ -22,9 +22,10 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
+from benchmarks._table_file import save_text
 from benchmarks.bend.variants import REDRAWS, SHARPNESS, fit_space
 from benchmarks.engine import Setting, choose_setting
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose.body import Body, centres_of, fit_body, fit_state
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.evaluation import Report
@@ -228,8 +229,7 @@ def main(
     })  # fmt: skip
     fill(report, data, out, particles, seeds, persons)
     print(report.summary())
-    with atomic_path(out / "real-bends.md") as path:
-        path.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out / "real-bends.md", report.to_markdown())
 
 
 if __name__ == "__main__":

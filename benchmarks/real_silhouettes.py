@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
@@ -35,9 +34,11 @@ from benchmarks._depth_silhouettes import (
     part_means,
     seeded,
 )
+from benchmarks._table_file import save_text
 from benchmarks.bodies.tracking import PARTS
 from benchmarks.silhouette.filters import METHODS
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
+from torchpose._core.reading import read_npz
 from torchpose.body import BODY_15, Body, JointLimits, body_joints, fit_body, fit_state
 from torchpose.camera import CameraRig, load_cameras
 from torchpose.evaluation import Report
@@ -83,8 +84,8 @@ def four_views(folder: Path) -> Filmed:
     silhouettes = torch.stack(list(read_silhouettes(sources, measurers)))
     for source in sources:
         source.close()
-    with np.load(folder / "multicam_pose2sim" / "balancing_4cam.npz") as z:
-        joints = body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
+    arrays = read_npz(folder / "multicam_pose2sim" / "balancing_4cam.npz")
+    joints = body_joints(torch.from_numpy(arrays["joints"]).double(), list(arrays["names"]))
     n = min(len(silhouettes), len(joints))
     return Filmed(silhouettes[:n], CameraRig([v.camera for v in views]), joints[:n])
 
@@ -279,8 +280,7 @@ def main(
     if only != "four":
         report_one(report, data, seeds, actions, out)
     print(report.summary())
-    with atomic_path(out / "real-silhouettes.md") as path:
-        path.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out / "real-silhouettes.md", report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._data import data_folder
 from benchmarks._signer_models import (
     FPS,
     SIDES,
@@ -30,7 +31,6 @@ from benchmarks._signer_models import (
     read_videos,
     released_filter,
 )
-from benchmarks._upper_body import data_folder
 from torchpose._core.files import check_output_folder
 from torchpose._core.reading import read_npz
 from torchpose.evaluation import Report

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks._data import data_folder
 from benchmarks._ub_one_tables import (
     SAMPLED,
     SUMMARY,
@@ -33,7 +34,7 @@ from benchmarks._ub_one_tables import (
     add_tables,
     fill_summary,
 )
-from benchmarks._upper_body import TRACKING, Tracker, data_folder, plain_prior, score, trials_of
+from benchmarks._upper_body import TRACKING, Tracker, plain_prior, score, trials_of
 from benchmarks.engine import Grid, Results
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._data import data_folder
 from benchmarks._gaps import add_gap_tables
 from benchmarks._people_tables import (
     BASELINE,
@@ -38,7 +39,6 @@ from benchmarks._upper_body import (
     TRACKING,
     Scores,
     Tracker,
-    data_folder,
     plain_prior,
     projected_training_poses,
     score,

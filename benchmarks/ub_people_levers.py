@@ -35,8 +35,9 @@ from benchmarks._levers import (
     Windows,
     read_persons,
 )
+from benchmarks._table_file import save_text
 from benchmarks.speed._timing import machine_line, markdown_table
-from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.files import check_output_folder
 from torchpose.camera._viewpoints import PAPER_VIEWS
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.priors._window import WindowLayout
@@ -203,8 +204,7 @@ def main(
         bar.set_postfix_str(f"{task.lever.name}, {task.mode}")
         known.append(bench.measure(*task))
         text = "\n\n".join([table(tasks, known, len(seeds)), *lines]) + "\n"
-        with atomic_path(out / "levers.md") as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        save_text(out / "levers.md", text)
     print(text, end="")
 
 

@@ -24,7 +24,7 @@ import torchpose
 from benchmarks import bones
 from benchmarks._command import run_command
 from benchmarks._lifters import FEW, LIFTERS, Lifter, fit_lifter
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from torchpose.evaluation import Report
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
@@ -160,8 +160,7 @@ def main(
         add_set(report, name, leave_out(data, name, quick))
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
-    if out is not None:
-        out.write_text("\n\n".join(tables) + "\n")
+    save_text(out, "\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from benchmarks._asl import CLIPS
 from benchmarks._asl_failures import draw_failures
 from benchmarks._asl_materials import CHANGES, Material, read_material
 from benchmarks._command import OneOf, run_command
+from benchmarks._data import data_folder
 from benchmarks._table_file import TableFile
 from benchmarks.speed._timing import Report, limit_threads
 from torchpose.errors import InputError
@@ -117,7 +118,7 @@ def main(
     limit_threads(threads)
     cv2.setNumThreads(threads)  # faces differ a little with the number of threads
     clips = list(clips[:1] if quick else clips)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     hand_prior = HandPrior.from_prior(load_prior(prior))
     report = Report("Hands in the clips of video_asl", out, threads)
     materials = {name: read_material(folder, name) for name in clips}

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._data import data_folder
+from benchmarks._table_file import TableFile, save_text
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -229,7 +230,7 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     clips = [read_clip(folder, name) for name in (CLIPS[:1] if quick else CLIPS)]
     fitted = load_prior(prior)
     methods = {
@@ -261,8 +262,7 @@ def main(
         "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
     }
     print(report.summary())
-    if out:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._data import data_folder
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose.measure import SkinMixtureModel
 from torchpose.measure._face import FaceTracker
@@ -82,7 +83,7 @@ def main(*, data: Path, quick: bool = False, out: TableFile | None = None) -> No
         out: file for the same as Markdown, or a folder.
     """
     torch.set_num_threads(1)
-    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    folder = data_folder(data, "video_asl")
     clips = CLIPS[:1] if quick else CLIPS
     every = 10 if quick else 3
     areas: dict[str, list[float]] = {name: [] for name in MODELS}
@@ -101,8 +102,7 @@ def main(*, data: Path, quick: bool = False, out: TableFile | None = None) -> No
     text = markdown_table(["area under the curve", *clips, "mean", "ms a frame"], rows)
     text += f"\n\n{processor_model()}, one thread, median of CPU times at 160 x 120, Lab given.\n"
     print(text, end="")
-    if out is not None:
-        out.write_text(text, encoding="utf-8")
+    save_text(out, text)
 
 
 def read_frames(folder: Path, name: str, every: int) -> Iterator[Frame]:

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._data import data_files, data_folder
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.hand_network.clips import BELOW, BURN_IN, LOWEST, SEEN, UNSEEN
 from torchpose import VideoTracker
 from torchpose.camera import PinholeCamera
@@ -125,8 +126,8 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    folder = data / "video_people" if (data / "video_people").is_dir() else data
-    references = sorted(folder.glob("*_mediapipe_pose1.npz"))[: 1 if quick else None]
+    folder = data_folder(data, "video_people")
+    references = data_files(folder, "*_mediapipe_pose1.npz")[: 1 if quick else None]
     fitted = load_prior(prior)
     report = Report("Keypoints of a detector in video of strangers")
     table = report.table("clips", "By clip: shares, and medians in widths of the shoulders", COLUMNS,
@@ -143,8 +144,7 @@ def main(
               [mean[0], invented, *middle[2:4], mean[4]])  # fmt: skip
     report.settings = {"detector": detector or "none", "prior": fitted.info.name}
     print(report.summary())
-    if out is not None:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 if __name__ == "__main__":

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from benchmarks._command import OneOf, run_command
-from benchmarks._table_file import TableFile
+from benchmarks._data import data_files
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.hand_network.clips import PEOPLE, SIGNERS
 from torchpose._core.images import Image
 from torchpose.demo._rendering.scene import Scene, room
@@ -180,15 +181,14 @@ def main(
     """
     torch.set_num_threads(threads)
     folders = ((data / "video_people", PEOPLE), (data / "video_asl", SIGNERS))
-    clips = [next(folder.glob(f"{name}.m*")) for folder, names in folders for name in names]
+    clips = [data_files(folder, f"{name}.m*")[0] for folder, names in folders for name in names]
     changes = {name: CHANGES[name] for name in only or CHANGES}
     most = MOST
     if quick:
         clips, most, changes = clips[-3:-2], 20, dict(list(changes.items())[:3])
     report = make_report(clips, changes, most)
     print(report.summary())
-    if out:
-        out.write_text(report.to_markdown(), encoding="utf-8")
+    save_text(out, report.to_markdown())
 
 
 def make_report(clips: list[Path], changes: dict[str, Change | None], most: int) -> Report:

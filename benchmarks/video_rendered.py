@@ -26,6 +26,7 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import OneOf, run_command
 from benchmarks._performances import performance
+from benchmarks._table_file import save_text
 from benchmarks._upper_body import MADE_WITH, Tracker
 from benchmarks.engine import Experiment, Grid, source_hash
 from benchmarks.speed._timing import markdown_table, processor_model
@@ -126,7 +127,7 @@ def main(
     ]
     text = report(outcomes, clips, look)
     print(text, end="")
-    (out / "video_rendered.md").write_text(text, encoding="utf-8")
+    save_text(out / "video_rendered.md", text)
     draw(outcomes, clips, out)
 
 

@@ -30,7 +30,7 @@ from pathlib import Path
 import torch
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.bones.fits import fit_shipped
 from benchmarks.bones.tables import add_group, draw, groups, priors_of
 from torchpose._core.files import check_output_folder
@@ -72,8 +72,7 @@ def main(
         add_group(report, group, *priors)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
-    if out is not None:
-        out.write_text("\n\n".join(tables) + "\n")
+    save_text(out, "\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import torchpose
+from benchmarks._data import data_files
 from torchpose.evaluation._trials import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import Recording, read_recordings
 from torchpose.skeleton import UPPER_BODY
@@ -76,7 +77,7 @@ def mhad_views(data: Path, every: int = EVERY) -> list[View]:
     camera = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
     rng = np.random.default_rng(0)
     views = []
-    for path in sorted((data / "mocap_berkeley_mhad").rglob("*.npz"))[7::every]:
+    for path in data_files(data / "mocap_berkeley_mhad", "**/*.npz")[7::every]:
         with np.load(path) as file:
             names = [str(name) for name in file["names"]]
             picked = [names.index(name) for name in _MHAD]
@@ -98,7 +99,7 @@ def openpose_views(data: Path) -> list[View]:
         data: folder with multicam_pose2sim/.
     """
     views = []
-    for path in sorted((data / "multicam_pose2sim").rglob("*.npz")):
+    for path in data_files(data / "multicam_pose2sim", "**/*.npz"):
         with np.load(path) as file:
             if "openpose_2d" not in file:
                 continue
@@ -138,7 +139,7 @@ def webcam_views(data: Path) -> list[View]:
     """
     views = []
     folders = (data / name for name in ("video_people", "video_asl"))
-    for path in (p for folder in folders for p in sorted(folder.glob("*_mediapipe_pose1.npz"))):
+    for path in (p for folder in folders for p in data_files(folder, "*_mediapipe_pose1.npz")):
         with np.load(path) as file:
             arrays = {key: file[key] for key in file.files}
         names = [str(name) for name in arrays["names"]]

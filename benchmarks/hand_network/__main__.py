@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.hand_network.clips import (
     BURN_IN,
     FOLDS,
@@ -231,8 +231,7 @@ def main(
     add_table(report, scores, errors)
     text = report["hands"].to_markdown()
     print(text)
-    if table is not None:
-        table.write_text(text + "\n")
+    save_text(table, text + "\n")
     if pictures is not None:
         for kind, count, path in draw_failures(pictures, found):
             print(f"{kind}: {count} hands, {path}")

@@ -11,8 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from benchmarks._data import data_files
 from benchmarks._performances import performance
 from torchpose import load_prior
+from torchpose._core.reading import read_npz
 from torchpose.demo import demo_camera
 from torchpose.demo._rendering import render_video
 from torchpose.measure import HandTracker, UpperBodyMeasurer
@@ -133,7 +135,7 @@ def read_clips(data: Path) -> list[Clip]:
     clips = []
     for folder, persons in (("video_people", PEOPLE), ("video_asl", SIGNERS)):
         for name, person in persons.items():
-            path = next((data / folder).glob(f"{name}.m*"))
+            (path, *_) = data_files(data / folder, f"{name}.m*")
             labels = _by_mediapipe(data / folder / f"{name}_mediapipe_pose1.npz", path)
             clips.append(Clip(name, person, path, labels))
     return clips
@@ -141,10 +143,10 @@ def read_clips(data: Path) -> list[Clip]:
 
 def _by_mediapipe(landmarks: Path, video: Path) -> Labels:
     """Return elbows, and hands at seven tenths of the way from wrist to index finger."""
-    with np.load(landmarks) as file:
-        names = [str(name) for name in file["names"]]
-        joints = torch.from_numpy(file["joints2d"]).double()
-        visible = torch.from_numpy(file["visibility"]).double()
+    arrays = read_npz(landmarks)
+    names = [str(name) for name in arrays["names"]]
+    joints = torch.from_numpy(arrays["joints2d"]).double()
+    visible = torch.from_numpy(arrays["visibility"]).double()
     with open_video(video) as source:
         size = source.size
     wrist, index, elbow, shoulder = (

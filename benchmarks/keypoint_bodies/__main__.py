@@ -24,7 +24,7 @@ from typing import Annotated
 import torch
 
 from benchmarks._command import OneOf, run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.keypoint_bodies.choosing import add_choices
 from benchmarks.keypoint_bodies.clips import (
     CHOOSING,
@@ -95,8 +95,7 @@ def main(
         add_real_table(report, chosen, data, quick)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
-    if out is not None:
-        out.write_text("\n\n".join(tables) + "\n")
+    save_text(out, "\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":

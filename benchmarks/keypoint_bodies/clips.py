@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from benchmarks._data import data_files
 from torchpose.body import BODY_15
 from torchpose.body._skeleton import other_side
 from torchpose.camera import CameraRig, PinholeCamera
@@ -205,7 +206,7 @@ def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iter
     Args:
         folder: of the set. names: of files without their suffix, or patterns. longest: frames.
     """
-    files = (path for name in names for path in sorted(folder.glob(f"{name}.*")))
+    files = data_files(folder, *(f"{name}.*" for name in names))
     for path in (path for path in files if path.suffix in (".npz", ".csv")):
         (clip,) = read_mocap(path, fps=None)
         if clip.fps > FASTEST:

@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks.keypoint_bodies.methods import CAUSAL, Method, takes
+from torchpose._core.reading import read_npz
 from torchpose.body import body_joints
 from torchpose.camera import CameraRig
 from torchpose.evaluation import Report
@@ -49,9 +49,9 @@ def read_filmed(data: Path) -> Filmed:
         data: folder with multicam_pose2sim/.
     """
     rig = CameraRig.load(data / _FOLDER / "raw" / "Calib_qualisys.toml")
-    with np.load(data / _FOLDER / "balancing_4cam.npz") as file:
-        found = torch.from_numpy(file["openpose_2d"]).double().transpose(0, 1)
-        names, fps = [str(name) for name in file["openpose_names"]], float(file["fps"])
+    arrays = read_npz(data / _FOLDER / "balancing_4cam.npz")
+    found = torch.from_numpy(arrays["openpose_2d"]).double().transpose(0, 1)
+    names, fps = [str(name) for name in arrays["openpose_names"]], float(arrays["fps"])
     found = found.masked_fill((found[..., 2] <= 0)[..., None], torch.nan)
     found = body_joints(found, names)
     keypoints = undistorted(rig, found[..., :2])

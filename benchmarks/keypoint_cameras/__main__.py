@@ -16,7 +16,7 @@ import torch
 from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 from benchmarks.keypoint_bodies.clips import CHOOSING, SCORED, Clip, read_clips
 from benchmarks.keypoint_cameras.disturbed import disturb
 from benchmarks.keypoint_cameras.real import add_real_cameras
@@ -67,8 +67,7 @@ def main(
     add_real_cameras(report, data)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
-    if out is not None:
-        out.write_text("\n\n".join(tables) + "\n")
+    save_text(out, "\n\n".join(tables) + "\n")
 
 
 def _add_table(

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._data import data_files
 from benchmarks.speed._timing import Report
 from torchpose.body import body_joints, fit_body, fit_state
 from torchpose.errors import InputError
@@ -48,7 +49,7 @@ def held_out_tables(data: Path, persons: Sequence[str], report: Report) -> None:
 def read_walks(folder: Path, person: str) -> Walks:
     """Return two trials to test on, two to end the fit, and the others to fit to."""
     trials = []
-    for file in sorted(folder.glob(f"s{person}_*.npz")):
+    for file in data_files(folder, f"s{person}_*.npz"):
         with np.load(file) as arrays:
             joints, names = torch.from_numpy(arrays["joints"]).double(), arrays["names"].tolist()
             trials.append(body_joints(joints[:: round(float(arrays["fps"]) / 60)], names))

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks._table_file import TableFile
+from benchmarks._table_file import TableFile, save_text
 
 THREAD_VARIABLES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
 
@@ -245,6 +245,13 @@ class Report:
         print(text, end="\n\n", flush=True)
         self.parts.append(text)
 
+    def leave_out(self, peer: str, error: ImportError) -> None:
+        """Say that the rows of a peer are left out, and how it is installed."""
+        self.add(
+            f"{peer} cannot be imported ({error}): its rows are left out. benchmarks/README.md says how to "
+            "install what torchpose is compared with."
+        )
+
     def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         """Print and keep a Markdown table."""
         self.add(markdown_table(header, rows))
@@ -258,6 +265,4 @@ class Report:
         if limits is not None:
             self.add(limits_line(limits))
         self.add(machine_line(self.threads, packages))
-        if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text("\n\n".join(self.parts) + "\n", encoding="utf-8")
+        save_text(self.out, "\n\n".join(self.parts) + "\n")

@@ -128,7 +128,7 @@ def make_methods(problem: Problem, report: Report) -> list[Method]:
         try:
             methods.append(make(problem))
         except ImportError as error:
-            report.add(f"{name} cannot be imported ({error}): its row is left out.")
+            report.leave_out(name, error)
     return methods
 
 

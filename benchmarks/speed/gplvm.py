@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
+from benchmarks._data import data_files
 from benchmarks.speed._gplvm_walks import held_out_tables
 from benchmarks.speed._timing import (
     Case,
@@ -76,6 +77,8 @@ def main(
         data: folder of mocap_cmu_walk; none: no held-out table.
         persons: of it.
     """
+    if data is not None:
+        data_files(data, *(f"s{person}_*.npz" for person in persons))  # missing ones are said first
     report = begin("A manifold: prediction and fit", setup)
     frames, sizes = (40, (60,)) if setup.quick else (FRAMES, SIZES)
     poses = walk(frames)
@@ -160,7 +163,7 @@ def make_methods(
             methods += gpytorch_methods(manifold, z, dtype)
     except ImportError as error:
         if not quiet:
-            report.add(f"gpytorch cannot be imported ({error}): its rows are left out.")
+            report.leave_out("gpytorch", error)
     return methods
 
 

@@ -142,7 +142,7 @@ def make_methods(problem: Problem, report: Report, quiet: bool) -> list[Method]:
             methods += make(problem)
         except ImportError as error:
             if not quiet:
-                report.add(f"{name} cannot be imported ({error}): its rows are left out.")
+                report.leave_out(name, error)
     return methods
 
 

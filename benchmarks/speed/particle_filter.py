@@ -167,7 +167,7 @@ def walk_rows(problem: Problem, n: int, report: Report) -> dict[str, Callable[[]
         try:
             rows[name] = make(problem, n)
         except ImportError as error:
-            report.add(f"{name}: not installed ({error.name}).")
+            report.leave_out(name, error)
     return rows
 
 

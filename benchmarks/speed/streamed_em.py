@@ -43,6 +43,7 @@ from benchmarks.speed.expectation_maximisation import (
     torchpose_fit,
     wide,
 )
+from torchpose.io._recordings import find_recordings
 from torchpose.learning._samplers import TensorSource
 from torchpose.learning._streamed_em import StreamedEM, run_streamed
 from torchpose.math._mixture_em import MixtureParameters
@@ -78,6 +79,8 @@ def main(
         samples: of the longest fit.
         data: folder of recordings, such as kinect_utd_mhad.
     """
+    if data is not None:
+        find_recordings([data])  # the processes read them, and missing ones are said before
     report = begin("EM over states that are not held in memory", setup)
     limits = measure_limits(setup.quick)
     failed = report_scaling(report, setup, data)
@@ -228,7 +231,7 @@ def peer_methods(problem: Problem, report: Report) -> Iterator[Method]:
         try:
             yield make(problem)
         except ImportError as error:
-            report.add(f"{name} cannot be imported ({error}): its row is left out.")
+            report.leave_out(name, error)
 
 
 def streamed_fit(problem: Problem, dtype: torch.dtype) -> Method:

@@ -38,6 +38,20 @@ def documented():
     )
 
 
+def test_every_command_is_on_the_list():
+    listed = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    names = set(re.findall(r"^\| `(?:python -m benchmarks\.)?(\w+)[^`]*` \|", listed, re.M))
+    commands = [
+        path
+        for path in (ROOT / "benchmarks").rglob("*.py")
+        if re.search(r"^    run_(command|protocol)\(", path.read_text("utf-8"), re.M)
+        or path.name in OWN_PARSERS
+    ]
+    found = {path.parent.name if path.stem == "__main__" else path.stem for path in commands}
+    assert found <= names
+    assert len(found) > 50
+
+
 def main_of(name):
     """Return the function that a command runs, of a module or of a package."""
     module = import_module(f"benchmarks.{name}")

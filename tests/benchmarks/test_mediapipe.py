@@ -1,8 +1,13 @@
 """The benchmarks on the webcam clips, on one of them."""
 
 import ast
+import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from benchmarks import mediapipe_landmarks
 from tests.benchmarks.conftest import ROOT
 from tests.data import data_dir_or_skip
 
@@ -52,3 +57,35 @@ def test_the_landmark_script_needs_nothing_of_torchpose():
         for alias in ([ast.alias(node.module)] if isinstance(node, ast.ImportFrom) else node.names)
     }
     assert imported.isdisjoint({"torch", "torchpose"})
+
+
+def test_the_landmark_script_says_what_is_missing_before_its_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(mediapipe_landmarks, "mediapipe", None)
+    (tmp_path / "clip.mp4").touch()
+    wanted = {
+        ("none.mp4", "out.npz"): "none.mp4: no such video file",
+        ("clip.mp4", "out"): "expected a name that ends in .npz",
+        ("clip.mp4", "none/out.npz"): "in a folder that is there",
+        ("clip.mp4", "out.npz"): "pip install mediapipe==0.10.21",
+    }
+    for (video, out), said in wanted.items():
+        line = ["mediapipe_landmarks", str(tmp_path / video), "--out", str(tmp_path / out)]
+        monkeypatch.setattr(sys, "argv", line)
+        with pytest.raises(SystemExit) as stop:
+            mediapipe_landmarks.main()
+        assert stop.value.code == 2
+        assert said in capsys.readouterr().err
+
+
+def test_landmarks_are_written_whole_or_not_at_all(tmp_path):
+    class Broken:
+        def __array__(self, *_, **__):
+            raise RuntimeError("broken")
+
+    path = tmp_path / "landmarks.npz"
+    mediapipe_landmarks.save(path, {"fps": 30.0})
+    with pytest.raises(RuntimeError, match="broken"):
+        mediapipe_landmarks.save(path, {"fps": 25.0, "joints2d": Broken()})
+    with np.load(path) as arrays:
+        assert float(arrays["fps"]) == 30.0
+    assert list(tmp_path.iterdir()) == [path]

@@ -4,7 +4,8 @@ import sys
 
 import pytest
 
-from benchmarks._table_file import table_file
+from benchmarks._table_file import save_text, table_file
+from benchmarks.speed._timing import Report
 from tests.data import few_recordings
 from torchpose.errors import InputError
 
@@ -49,6 +50,24 @@ def test_a_table_goes_to_a_file_or_into_a_folder(tmp_path, monkeypatch):
     for given in ("file.md/table.md", "folder"):
         with pytest.raises(InputError, match="file or a folder that can be"):
             table_file(str(tmp_path / given))
+
+
+def test_a_table_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "table.md"
+    save_text(path, "first ± 1\n")
+    with pytest.raises(UnicodeEncodeError):
+        save_text(path, "second\ud800")
+    save_text(None, "nowhere")
+    assert path.read_text(encoding="utf-8") == "first ± 1\n"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_peer_that_is_missing_is_named_with_how_to_install_it(capsys):
+    report = Report("Speed", None, 1)
+    report.leave_out("filterpy", ModuleNotFoundError("No module named 'filterpy'"))
+    printed = capsys.readouterr().out
+    assert "filterpy cannot be imported (No module named 'filterpy')" in printed
+    assert "benchmarks/README.md" in printed
 
 
 def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(run_here, tmp_path):

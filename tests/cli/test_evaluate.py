@@ -105,3 +105,12 @@ def test_parsers_of_the_real_ones(name):
         ["--data", "d", "--out", "o", "--seed", "1"]
     )
     assert (args.data, args.out, args.seed) == ("d", "o", 1)
+
+
+def test_the_help_of_lists_shows_what_is_taken():
+    parser = evaluate.build("learning-curve", evaluate.PROTOCOLS["learning-curve"])
+    text = parser.format_help()
+    assert "--counts [N,...]" in text and "--more [DIR,...]" in text
+    assert "torchpose.learning._" not in text
+    args = parser.parse_args(["d", "--out", "o", "--counts", "[1,2]", "--more", "[a/,b/]"])
+    assert list(args.counts) == [1, 2] and list(args.more) == ["a/", "b/"]

@@ -80,6 +80,21 @@ def test_types_defaults_choices_and_texts():
     assert found["exact"].flag == "--exact" and found["exact"].help.endswith("(default false)")
 
 
+def test_the_placeholder_of_a_list_says_how_it_is_typed():
+    def draw(
+        lines: list[int] | None = None,
+        steps: tuple[float, ...] = (),
+        names: Sequence[str] = (),
+        files: Sequence[str] = (),
+    ) -> None:
+        """Draw."""
+
+    options = options_of(draw, spaced=("files",))
+    shown = {option.name: option.metavar for option in options}
+    expected = {"lines": "[N,...]", "steps": "[X,...]", "names": "[NAMES,...]", "files": "FILES"}
+    assert shown == expected
+
+
 def test_texts_of_a_docstring_that_names_parameters_within_sentences():
     def fit(steps: int, fps: float, actions: str):
         """Fit.
@@ -220,6 +235,8 @@ def test_every_option_has_a_help_and_the_default_of_its_function(name):
         assert option.help, f"{name} {option.flag} has no help"
         expected = None if option.default is REQUIRED else option.default
         assert defaults[option.key] == expected, option.flag
+    text = command.parser().format_help()
+    assert "+ [" not in text, "jsonargparse's flag that appends to a list"
     parameters = inspect.signature(command.run).parameters
     assert {"given"} | parameters.keys() >= {o.name for o in command.own} | command.groups.keys()
 

@@ -15,16 +15,16 @@ from torchpose.cli._options import REQUIRED, Option, options_of, summary_of
 from torchpose.errors import InputError
 
 _METAVARS = {
-    "action": "NAME|FILE", "actions": "ACTION", "body": "FILE",
+    "action": "NAME|FILE", "actions": "ACTION", "arms": "FILE", "body": "FILE",
     "bone_lengths": "NAME=M,...", "camera": "FILE|fx,fy,cx,cy", "camera_name": "NAME",
-    "camera_names": "NAMES", "components": "K", "conditionals": "NAME|FILE",
+    "camera_names": "NAME,...", "components": "K", "conditionals": "NAME|FILE",
     "delays": "[n,n,...]", "face_model": "FILE",
     "facing": "[x,y,z]", "fps": "HZ", "height": "M", "held_out": "PERSON",
     "initial_pose": "FILE", "licence": "TEXT", "manifold": "NAME|FILE", "max_gap": "S",
-    "measurement_std": "PX", "neck": "KIND", "noise_of": "PRIOR", "out": "DIR",
-    "persons": "PERSON", "prior": "NAME|FILE", "recordings": "DIR", "seconds": "S",
-    "smoothing": "N|full", "videos": "VIDEO", "what": "PRIOR|FILE", "window_components": "K",
-    "without": "PERSON", "without_files": "NAME",
+    "measurement_std": "PX", "motion": "NAME|FILE", "neck": "KIND", "noise_of": "PRIOR",
+    "out": "DIR", "person": "FILE", "persons": "PERSON", "prior": "NAME|FILE",
+    "recordings": "DIR", "seconds": "S", "smoothing": "N|full", "videos": "VIDEO",
+    "what": "PRIOR|FILE", "window_components": "K", "without": "PERSON", "without_files": "NAME",
 }  # fmt: skip
 _HOW = ("out", "config", "pictures")  # no part of what is made
 _SHOWN_PATHS = 8
@@ -214,7 +214,8 @@ def _add(parser: ArgumentParser, option: Option, kind: Any, metavar: str) -> Non
         return
     default = list(option.default) if isinstance(option.default, tuple) else option.default
     settings |= {"required": True} if required else {"default": default}
-    parser.add_argument(option.flag, **settings)
+    action = parser.add_argument(option.flag, **settings)
+    action.option_strings = [option.flag]  # of lists also with a +, which the help need not show
 
 
 def _item(kind: Any) -> Any:

@@ -17,6 +17,10 @@ from torchpose.errors import InputError
 Data = Literal["folder", "recordings", "mocap"]
 _COMMON = ("data", "out", "seed", "progress", "prior")
 _MOVED = "earlier-*/*"
+_METAVARS = {
+    "added": "[DIR,...]", "compare": "[NAME=MODULE.FUNCTION,...]", "fits": "DIR", "more": "[DIR,...]",
+    "out": "DIR", "part": "cross|added|both", "prior": "NAME|FILE", "tested": "[PERSON,...]",
+}  # fmt: skip
 _EXAMPLES: dict[Data, str] = {
     "folder": "--data data/",
     "recordings": "mine/ more/",
@@ -152,8 +156,7 @@ def build(command: str, protocol: Protocol, program: str = "torchpose") -> Argum
             "score this prior, fitted on other persons, instead of fitting one"
         )
         common.append(Option("prior", "prior", str, None, text))
-    metavars = {"out": "DIR", "prior": "NAME|FILE"}
-    add_options(parser, [*common[:2], *protocol.options, *common[2:]], metavars=metavars)
+    add_options(parser, [*common[:2], *protocol.options, *common[2:]], metavars=_METAVARS)
     return parser
 
 

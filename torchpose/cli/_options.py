@@ -47,14 +47,16 @@ class Option(NamedTuple):
 
     @property
     def metavar(self) -> str:
-        """Return the placeholder of the value in the help: the choices, a letter for a number, or a name."""
+        """Return the placeholder: choices, a letter for a number, a name, or a list of these."""
         words = _words(self.kind)
         if words:
             return "|".join(words)
-        kinds = {self.kind, *typing.get_args(self.kind)}
+        found = [part for part in (self.kind, *typing.get_args(self.kind)) if _is_list(part)]
+        kinds = {part for kind in (self.kind, *found) for part in (kind, *typing.get_args(kind))}
         if bool in kinds:
             return "true|false"
-        return "N" if int in kinds else "X" if float in kinds else self.key.upper()
+        one = "N" if int in kinds else "X" if float in kinds else self.key.upper()
+        return f"[{one},...]" if found and not self.spaced else one
 
     @property
     def help(self) -> str:
@@ -236,11 +238,14 @@ def _given_on_a_line(hint: Any) -> Any:
     if typing.get_origin(hint) in (Union, types.UnionType):
         kinds = [kind for part in parts if (kind := _given_on_a_line(part)) is not None]
         return Union[tuple(kinds)] if kinds else None  # noqa: UP007  # of a list
-    lists = (list, tuple, Sequence, typing.get_origin(Sequence[str]))
-    if typing.get_origin(hint) in lists:
+    if _is_list(hint):
         plain = all(part is Ellipsis or _given_on_a_line(part) is not None for part in parts)
         return hint if plain else None
     return None
+
+
+def _is_list(hint: Any) -> bool:
+    return typing.get_origin(hint) in (list, tuple, typing.get_origin(Sequence[str]))
 
 
 def _takes_none(hint: Any) -> bool:

@@ -153,7 +153,7 @@ def run(
         camera_names: which cameras of the file the inputs are of, if not all in order.
         detector: find keypoints in the videos: a model in ONNX (.onnx), a pose landmarker of MediaPipe
             (.task), or package:factory, a Python callable that returns a detector.
-        min_confidence: with --detector: of a keypoint, below which it counts as missing (default 0.3).
+        min_confidence: with --detector: treat keypoints as missing below this confidence (default 0.3).
         smoothing: kalman: "full" lets later frames count too.
         refine: kalman: estimate the cameras' delays against the first, their poses (extrinsics), or both
             from the person who moves, and write refined_cameras.toml.

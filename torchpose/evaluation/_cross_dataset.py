@@ -126,7 +126,7 @@ def run(
         n_components, window_components, window_samples, every, workers, fits: see
             `torchpose.evaluation._leave_one_person_out.run`.
         quick: small priors and few sequences, to see that all of it works.
-        part: the part to run: "cross", "added" (motion capture for training) or "both".
+        part: the part to run: "cross", "added" (motion capture for training) or "both" (default).
         tested: persons whom no prior of their own data set sees; by default the last quarter of a data
             set.
         added: folders of motion capture for the second part, with shoulders, elbows, wrists and hips;

@@ -84,8 +84,7 @@ def run(
         n_subsets: the number of fits for each count, at most one for each person.
         n_own: the number of persons for whom a prior of their own is fitted; 0 leaves that part out, and
             persons with one recording are left out of it.
-        compare: other recipes to draw beside `torchpose.learning._recipes.fit_kinect_prior`, each as
-            NAME=module.function.
+        compare: other recipes to draw beside the one of the shipped priors, each as NAME=module.function.
         recipes: names and functions, instead of all that.
 
     Raises:

@@ -60,7 +60,8 @@ def run(
         window_samples: the number of training windows; by default that of the recipe.
         calibration_folds: the number of folds of the calibration; 0 leaves covariances uncalibrated.
         every: track only each n-th sequence of a person. workers: the number of processes.
-        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
+        fits: the folder of fitted priors, to share them with other protocols; by default that of
+            the results.
         recipe: fits the priors.
 
     Raises:

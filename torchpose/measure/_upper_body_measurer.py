@@ -128,7 +128,7 @@ class UpperBodyMeasurer(nn.Module):
             "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
         background: whether to detect the foreground, for a static camera.
         elbows: whether to measure elbows: by the network, or without one where the torso with its sleeves
-            is widest. None measures them if hands are "learnt".
+            is widest. By default they are measured if hands are "learnt".
         face_detector: by default Haar's.
         max_persons: at most so many persons at a time are measured, those with the largest faces; who is
             measured gives way to a face that is a fifth larger.

@@ -116,7 +116,7 @@ class VideoTracker(nn.Module):
             paper's method.
         background: detect the foreground, for a static camera.
         elbows: measure elbows: by the network, or without one where the torso with its sleeves is widest.
-            None measures them if hands are "learnt".
+            By default they are measured if hands are "learnt".
         edges: correct swapped hands by the edges of the arms (`HandAssociation`); takes about twice
             the time of the poses.
         candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then

@@ -107,8 +107,9 @@ class BodyTracker(nn.Module):
             default what suits the method.
         initial_cov: the variances of the particles about the first pose, as `process_cov`; by default
             four times those.
-        keypoint_std: how far a detector's joints are from the body's, metres along each axis;
-            keypoints of low confidence are farther. pixel_std: the same in pixels, on top of it.
+        keypoint_std: how far a detector's joints are from the body's, metres along each axis (default
+            0.012, with one camera 0.03); keypoints of low confidence are farther. pixel_std: the same in
+            pixels, on top of it (default 1).
         motion: of "kalman", how bodies move, a name that `torchpose info` lists, or a file of `torchpose
             fit body`; in Python also the `BodyMotion` itself.
         up: of "kalman", "y" or "z", the axis of the world that points up; people are then expected upright.
