@@ -271,7 +271,8 @@ class UpperBodyMeasurer(nn.Module):
             if self.learnt:
                 found = Elbows(hands.elbows, hands.elbow_covariance, hands.elbow_seen)
             else:
-                found = self._elbows(image, faces, hand_state.skin)
+                gain = torch.ones(len(faces)) if view.hands is None else view.hands.gain
+                found = self._elbows(image, faces, hand_state.skin, gain)
             parts.append((_where_seen(found), found.covariance))
         keypoints = torch.cat([points.to(faces) for points, _ in parts], 1)
         cov = torch.cat([own.to(faces) for _, own in parts], 1)
@@ -303,18 +304,22 @@ class UpperBodyMeasurer(nn.Module):
             raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
         return tracker.step(state, image, view.faces, view.number, view.foreground)
 
-    def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> Elbows:
+    def _elbows(self, image: Image, faces: Tensor, skin: SkinState, gain: Tensor) -> Elbows:
         """Return the elbows from the clothes, in images scaled such that faces have one size.
+
+        The colours of skin are those of images that were multiplied by the gain of each person.
 
         The scale of a person's image depends on that person's face alone.
         """
 
         def measure(scale: float, rows: Tensor) -> Elbows:
-            return self._elbows_at(image, scale, faces[rows], take_rows(skin, rows))
+            return self._elbows_at(image, scale, faces[rows], take_rows(skin, rows), gain[rows])
 
         return measure_by_scale((_TORSO_FACE / faces[:, 2]).clamp_max(1.0), measure)
 
-    def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> Elbows:
+    def _elbows_at(
+        self, image: Image, scale: float, faces: Tensor, skin: SkinState, gain: Tensor
+    ) -> Elbows:
         """Return the elbows of persons in an image that is made smaller by this factor."""
         import cv2
 
@@ -322,7 +327,8 @@ class UpperBodyMeasurer(nn.Module):
         small = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
         pixels = torch.from_numpy(np.asarray(small)).permute(2, 0, 1)[None].float() / 255
         model = self.hand_tracker.skin
-        bins = model.bins(rgb_to_lab(pixels)).expand(len(faces), -1, -1)
+        lit = (pixels * gain.to(pixels)[:, None, None, None]).clamp_max(1)
+        bins = model.bins(rgb_to_lab(lit))
         shrunk = torch.cat([(faces[:, :2] + 0.5) * scale - 0.5, faces[:, 2:] * scale], 1)
         found = elbows_from_torso(clothes_likelihood(model, skin, bins), shrunk)
         return Elbows((found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen)
