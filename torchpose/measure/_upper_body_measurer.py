@@ -216,7 +216,7 @@ class UpperBodyMeasurer(nn.Module):
             InputError: another kind of image.
         """
         tracks = self._follow_faces(seen.faces, image)
-        faces, face_cov, identity, unseen = self._used(tracks, _face_scale(image))
+        faces, face_cov, identity, unseen = self._used(tracks, image)
         detected = unseen <= 2 * self.face_tracker.every
         persons, number = self.register.step(
             seen.persons, image, faces, identity, seen.frame, detected
@@ -333,9 +333,14 @@ class UpperBodyMeasurer(nn.Module):
         found = elbows_from_torso(clothes_likelihood(model, skin, bins), shrunk)
         return Elbows((found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen)
 
-    def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen."""
+    def _used(self, tracks: FaceTracks, image: Image) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen.
+
+        A face that has left the image is not measured there any more.
+        """
+        scale, at = _face_scale(image), tracks.mean[:, :2]
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
+        used &= ((at >= 0) & (at < scale * at.new_tensor([image.shape[1], image.shape[0]]))).all(-1)
         rows = torch.nonzero(used).flatten()
         faces = scaled_back(tracks.mean[rows, :3], scale)
         cov = tracks.cov[rows, :3, :3] / scale**2
