@@ -165,4 +165,4 @@ def test_refusals(track, options, said):
 def test_nobody_is_said(track):
     done = track("--detector", "some_detectors:nobody")
     assert done.code == 1
-    assert f"no person was seen for long enough in the {N} frames" in done.err
+    assert f"no person was seen for half a second or longer in the {N} frames" in done.err

@@ -16,6 +16,7 @@ from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter, open_video
 from torchpose.video._camera import CameraSource
+from torchpose.video._file import FileSource
 
 N = 45
 SUFFIXES = (".npz", ".csv", ".bvh")
@@ -101,7 +102,7 @@ def test_a_video_without_a_face_has_no_poses(track, tmp_path):
             writer.write(np.full((120, 160, 3), 90, np.uint8))
     done, out = track(grey)
     assert done.code == 1
-    assert "no face was seen for long enough in the 20 frames" in done.err
+    assert "no face was seen for half a second or longer in the 20 frames (0.67 s)" in done.err
     assert not list(out.iterdir())
 
 
@@ -194,8 +195,28 @@ def test_the_first_interruption_ends_the_recording_and_the_second_is_real():
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
+    with UntilInterrupted(range(4)) as items:
+        assert list(items) == [0, 1, 2, 3]
+        os.kill(os.getpid(), signal.SIGINT)
+        assert not items.interrupted, "nothing is left out"
     with UntilInterrupted(range(10), stop=lambda: True) as items:
         assert list(items) == []
+
+
+def test_a_recording_that_was_stopped_says_so(clip, track, monkeypatch):
+    read = FileSource._read
+
+    def stopped(self):
+        for frame in read(self):
+            if frame.index == 30:  # at once: a signal reaches the main thread when that has time
+                signal.getsignal(signal.SIGINT)(signal.SIGINT, None)
+            yield frame
+
+    monkeypatch.setattr(FileSource, "_read", stopped)
+    done, out = track(clip[0], "--overlay", "false")
+    assert done.code == 0, done.err
+    said = f"stopped by Ctrl-C after 30 of {N} frames: the rest was not tracked"
+    assert said in done.out and said in PoseTrack.load(out / "poses.npz").notes
 
 
 def test_refusals(torchpose, files, clip, tmp_path):

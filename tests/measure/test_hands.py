@@ -185,6 +185,13 @@ def test_a_frame_of_4k_is_like_a_small_one(prior, clip, tracked):
         assert (small - tracked[1][t].points).abs().max() < 0.1 * 76
 
 
+def test_a_dark_room_is_like_a_bright_one(prior, clip, tracked):
+    dark = [(0.08 * frame).astype(np.uint8) for frame in clip]
+    _, out = follow(HandTracker(prior), dark, [(320.0, 120.0, 76.0)])
+    apart = torch.cat([one.points - two.points for one, two in zip(out, tracked[1], strict=True)])
+    assert float(apart[5:].norm(dim=-1).max()) < 0.15 * 76
+
+
 def test_hands_out_of_the_image_are_not_seen(prior):
     """A narrow view of head and shoulders: no skin is invented where the image has ended."""
     frames = [scene(t)[:230, 200:440].copy() for t in range(8)]

@@ -132,6 +132,23 @@ def test_one_of_two_in_the_same_clothes_is_followed_and_is_one_person():
     assert set(followed[:34]) == {(0, False)} and set(followed[-12:]) == {(1, True)}
 
 
+def test_who_leaves_the_image_is_not_measured_beyond_its_border():
+    pytest.importorskip("cv2")
+    image, found = scene((300, RED))[0], torch.zeros(0, 3)
+    measurer = UpperBodyMeasurer(
+        load_prior("kinect-upper-body-small"), face_detector=lambda grey, region=None: found
+    )
+    seen, places = measurer.init().seen, []
+    for x in range(300, 900, 12):
+        inside = x < 600  # half a face is not found
+        found = torch.tensor([[x, 50.0, 80.0]][:inside], dtype=torch.float64).reshape(-1, 3)
+        view = measurer.look(seen, image)
+        seen = view.after
+        places += view.faces[:, 0].tolist()
+    assert 600 < max(places) < 640, "it is measured until it has left, and not any longer"
+    assert float(seen.faces.mean[0, 0]) > 640
+
+
 def test_bad_settings_are_refused():
     with pytest.raises(InputError, match="likeness"):
         PersonRegister(likeness=0.0)

@@ -139,15 +139,18 @@ def test_the_measurer_looks_at_everybody_in_an_image_of_their_own_scale():
     skin = model.learn(
         model.init(3), bins.expand(3, -1, -1), parts_of_persons(faces, bins.shape[1:])
     )
-    together = measurer._elbows(image, faces, skin)
+    gain = torch.ones(3)
+    together = measurer._elbows(image, faces, skin, gain)
     assert together.seen.all()
     for n in range(3):
         own = SkinState(*(x[n : n + 1] for x in skin))
-        alone = measurer._elbows(image, faces[n : n + 1], own)
+        alone = measurer._elbows(image, faces[n : n + 1], own, gain[:1])
         for found, expected in zip(together, alone, strict=True):
             assert torch.equal(found[n], expected[0])
-    nobody = measurer._elbows(image, faces[:0], SkinState(*(x[:0] for x in skin)))
+    nobody = measurer._elbows(image, faces[:0], SkinState(*(x[:0] for x in skin)), gain[:0])
     assert nobody.points.shape == (0, 2, 2)
+    dark = measurer._elbows(image // 5, faces, skin, 5 * gain)
+    assert dark.seen.all() and (dark.points - together.points).abs().max() < 1
 
 
 def test_support_is_the_least_reach_over_rows_of_the_own_size():

@@ -16,12 +16,12 @@ class UntilInterrupted(Generic[T]):
     A context manager, to be used in the main thread; the items may be taken in another.
 
     Attributes:
-        count: items so far. interrupted: whether they ended early.
+        count: items so far. interrupted: whether items were left out.
     """
 
     def __init__(self, items: Iterable[T], stop: Callable[[], bool] = lambda: False) -> None:
         self._items, self._stop = items, stop
-        self.count, self.interrupted = 0, False
+        self.count, self.interrupted, self._asked = 0, False, False
 
     def __enter__(self) -> Self:
         self._before = signal.signal(signal.SIGINT, self._interrupt)
@@ -32,16 +32,16 @@ class UntilInterrupted(Generic[T]):
 
     def __iter__(self) -> Iterator[T]:
         for item in self._items:
-            if self.interrupted or self._stop():
+            if self._asked or self._stop():
                 self.interrupted = True
                 return
             self.count += 1
             yield item
 
     def _interrupt(self, *_: object) -> None:
-        if self.interrupted:
+        if self._asked:
             raise KeyboardInterrupt
-        self.interrupted = True
+        self._asked = True
 
 
 def share_cores() -> None:

@@ -65,7 +65,8 @@ def track_video(
             seconds = time.perf_counter() - start
         notes += tuple(source.notes)  # some of them are known once it is closed
         if not people:
-            return _nobody(job.input, n_frames, notes, results.folder, options["detector"])
+            detector = options["detector"]
+            return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
         facts = {
             "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
             "prior": prior.info.name or settings.prior,
@@ -144,6 +145,11 @@ def _track_recording(
     """Return everybody in a file or folder and how many frames it had; Ctrl-C ends the recording."""
     with UntilInterrupted(source) as frames:
         people = tracker(frames, progress=show_progress(), n_frames=source.n_frames, folder=out)
+    if frames.interrupted:
+        of = "" if source.n_frames is None else f" of {source.n_frames}"
+        source.notes.append(
+            f"stopped by Ctrl-C after {frames.count}{of} frames: the rest was not tracked"
+        )
     return people, frames.count
 
 
@@ -296,7 +302,12 @@ def _measured_by(options: dict[str, Any]) -> str:
 
 
 def _nobody(
-    where: str, n_frames: int, notes: tuple[str, ...], out: Path, detector: str | None
+    where: str,
+    n_frames: int,
+    fps: float,
+    notes: tuple[str, ...],
+    out: Path,
+    detector: str | None,
 ) -> int:
     """Print that there is no pose and the reason; return the exit code."""
     if (out / "poses.npz").exists():
@@ -313,8 +324,8 @@ def _nobody(
         what = "person"
         wants = f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
     print(
-        f"torchpose: no {what} was seen for long enough in the {n_frames} frames of {where}, so "
-        f"there are no poses. {wants}",
+        f"torchpose: no {what} was seen for half a second or longer in the {n_frames} frames "
+        f"({n_frames / fps:.2g} s) of {where}, so there are no poses. {wants}",
         file=sys.stderr,
     )
     return 1

@@ -19,6 +19,7 @@ from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
 from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
+from torchpose.measure._brightness import brightened, gain_to
 from torchpose.measure._skin import SkinModel
 
 CELL = 0.1  # side of a cell, in B
@@ -26,6 +27,11 @@ CELLS = (88, 96)  # rows and columns of cells
 EVIDENCE, COLOURS = 2, 4  # pixels of the finer maps for each cell
 _LEFT, _TOP = -0.5 * CELLS[1] * CELL, -3.2  # edges, in B from the anchor
 _STEP = 12  # a window's columns are a multiple of this, so that its rows are whole pixels too
+_DARK = 80.0  # brightness of the brightest parts of a window that needs no gain
+_FACE_PART = tuple(  # every fourth pixel of the face in a window
+    slice(round((middle - 0.5) / CELL * COLOURS), round((middle + 0.5) / CELL * COLOURS), COLOURS)
+    for middle in (-_TOP, -_LEFT)
+)
 _FINEST = 3  # up to this many pixels to one are averaged; of more, some are left out
 
 
@@ -102,10 +108,16 @@ def cut_windows(image: Image, anchors: Float[Tensor, "N 3"]) -> list[NDArray[np.
 
 def cut_colours(
     frame: Image, anchors: Float[Tensor, "N 3"], part: tuple[slice, slice]
-) -> tuple[UInt8[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"], UInt8[Tensor, "N 3 p q"]]:
-    """Return the windows in Lab, bytes [N, 3, 176, 192], the same smoothed, and a finer part [N, 3, p, q].
+) -> tuple[
+    UInt8[Tensor, "N 3 h w"],
+    Float[Tensor, "N 3 h w"],
+    UInt8[Tensor, "N 3 p q"],
+    Float[Tensor, " N"],
+]:
+    """Return the windows in Lab, bytes [N, 3, 176, 192], the same smoothed, a finer part [N, 3, p, q], gains.
 
-    By OpenCV, for one person after the other, as in `cut_windows`.
+    By OpenCV, for one person after the other, as in `cut_windows`. A window that is dark, its face
+    included, is multiplied by its gain [N], which is 1 for all others.
 
     Args:
         frame: RGB [H, W, 3]. anchors: from `place_windows`.
@@ -117,13 +129,23 @@ def cut_colours(
     labs = np.empty((len(anchors), 3, height, width), np.uint8)
     smooth = np.empty(labs.shape, np.float32)
     parts = np.empty((*labs.shape[:2], *(side.stop - side.start for side in part)), np.uint8)
+    gains = np.ones(len(anchors))
     for n, window in enumerate(cut_windows(frame, anchors)):
+        gains[n] = gain_to(_DARK, _brightest(window))
+        window = brightened(window, gains[n])
         small = cv2.resize(window, (width, height), interpolation=cv2.INTER_AREA)
         lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
         cv2.split(lab, [*labs[n]])
         cv2.split(cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8), [*smooth[n]])
         cv2.split(cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB), [*parts[n]])
-    return torch.from_numpy(labs), torch.from_numpy(smooth), torch.from_numpy(parts)
+    colours = torch.from_numpy(labs), torch.from_numpy(smooth), torch.from_numpy(parts)
+    return *colours, torch.from_numpy(gains)
+
+
+def _brightest(window: Image) -> float:
+    """Return the brightness of the brightest parts of a window, or of its face if that is brighter."""
+    face = float(np.quantile(window[_FACE_PART], 0.9))
+    return face if face >= _DARK else max(face, float(np.quantile(window[::8, ::8], 0.98)))
 
 
 def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:

@@ -15,6 +15,7 @@ from torchpose._core.checks import check_finite, check_grey, check_shape
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
+from torchpose.measure._brightness import brightened, gain_to
 
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
@@ -23,7 +24,7 @@ _USUAL = 40.0  # size above which faces are searched for first, pixels
 _CLEAR = 26.0  # size to which the smallest face of a search is enlarged, pixels
 _STRICTER = 1  # boxes more that must agree in an enlarged image
 _LEAST = 4.0  # size below which a track ends: it was lost while it became smaller, pixels
-_BRIGHT, _MOST_GAIN = 160.0, 6.0  # grey of the brightest parts of an image that needs no gain
+_BRIGHT = 160.0  # grey of the brightest parts of an image that needs no gain
 _TILT = 25.0  # degrees by which an image is turned to find tilted faces
 # Where a far smaller face is a pattern on somebody's head or clothes, in sizes of that person's face.
 _SMALLER_BY, _BESIDE, _ABOVE, _BELOW = 0.7, 0.8, 0.8, 3.0
@@ -145,10 +146,7 @@ class HaarFaceDetector:
 
 def _brightened(image: Image) -> Image:
     """Return the image, multiplied if its brightest parts are dark."""
-    gain = min(_MOST_GAIN, _BRIGHT / max(float(np.quantile(image[::4, ::4], 0.98)), 1.0))
-    if gain <= 1:
-        return image
-    return np.asarray((np.arange(256) * gain).clip(0, 255), np.uint8)[image]
+    return brightened(image, gain_to(_BRIGHT, float(np.quantile(image[::4, ::4], 0.98))))
 
 
 def _resized(image: Image, scale: float) -> Image:

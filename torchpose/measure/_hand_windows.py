@@ -58,8 +58,9 @@ class HandView(NamedTuple):
         anchors: of the windows in this frame, and before: in the last one, (x, y, B), pixels.
         moved: whether the two differ. faces: (x, y, B), pixels, B steady.
         near: the same in B from the anchors.
-        lab: bytes. head: `head_part` of the window, bytes, four pixels for a cell. bins: of the skin's
-            histograms. inside: share of each pixel in the image. foreground: share; None if not known.
+        lab: bytes. head: `head_part` of the window, bytes, four pixels for a cell.
+        gain: that dark windows were multiplied by before. bins: of the skin's histograms.
+        inside: share of each pixel in the image. foreground: share; None if not known.
         maps: difference from the last frame and from the median, 0 outside of the image [N, 2, 176, 192].
         flow: of `Motion`.
         colours: features of the network, from colours alone; None without a network.
@@ -80,6 +81,7 @@ class HandView(NamedTuple):
     near: Float[Tensor, "N 3"]
     lab: UInt8[Tensor, "N 3 h w"]
     head: UInt8[Tensor, "N 3 p q"]
+    gain: Float[Tensor, " N"]
     bins: Int[Tensor, "N h w"]
     inside: Float[Tensor, "N h w"]
     foreground: Float[Tensor, "N h w"] | None
@@ -139,7 +141,7 @@ class HandWindows:
         anchors, moved = follow_faces(before, faces, s.stray, s.rescale)
         if bool(moved.any()):
             motion = self.motion.move(motion, before, anchors, moved)
-        lab, smooth, head = cut_colours(frame, anchors, head_part(COLOURS))
+        lab, smooth, head, gain = cut_colours(frame, anchors, head_part(COLOURS))
         motion, moving, unusual, flow = self.motion.step(motion, smooth, lab[:, 0])
         inside = inside_image(anchors, frame.shape[1], frame.shape[0], EVIDENCE)
         near = faces_in_window(faces, anchors)
@@ -152,7 +154,7 @@ class HandWindows:
         log_prior, elbow = self._prior(near)
         view = HandView(
             (frame.shape[0], frame.shape[1]), identity, anchors, before, moved, faces, near,
-            lab, head, self.skin.byte_bins(lab), inside, mask, maps, flow, colours, over_hands,
+            lab, head, gain, self.skin.byte_bins(lab), inside, mask, maps, flow, colours, over_hands,
             self._moves(over_hands[:, 0], log_prior),
             parts_of_persons(faces_in_evidence(faces, anchors), lab.shape[2:]),
             log_prior, self._rebirth(log_prior, near), elbow, self.likelihood.shape_places(elbow),

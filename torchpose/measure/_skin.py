@@ -60,6 +60,8 @@ def rgb_to_lab(images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
         from kornia.color import rgb_to_lab as by_kornia
 
         return by_kornia(images)
+    if not images.numel():
+        return images
     import cv2
 
     batch, _, height, width = images.shape

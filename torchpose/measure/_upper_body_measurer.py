@@ -204,7 +204,7 @@ class UpperBodyMeasurer(nn.Module):
             InputError: another kind of image.
         """
         tracks = self._follow_faces(seen.faces, image)
-        faces, face_cov, identity, unseen = self._used(tracks, _face_scale(image))
+        faces, face_cov, identity, unseen = self._used(tracks, image)
         detected = unseen <= 2 * self.face_tracker.every
         persons, number = self.register.step(
             seen.persons, image, faces, identity, seen.frame, detected
@@ -259,7 +259,8 @@ class UpperBodyMeasurer(nn.Module):
             if self.learnt:
                 found = Elbows(hands.elbows, hands.elbow_covariance, hands.elbow_seen)
             else:
-                found = self._elbows(image, faces, hand_state.skin)
+                gain = torch.ones(len(faces)) if view.hands is None else view.hands.gain
+                found = self._elbows(image, faces, hand_state.skin, gain)
             parts.append((_where_seen(found), found.covariance))
         keypoints = torch.cat([points.to(faces) for points, _ in parts], 1)
         cov = torch.cat([own.to(faces) for _, own in parts], 1)
@@ -291,18 +292,22 @@ class UpperBodyMeasurer(nn.Module):
             raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
         return tracker.step(state, image, view.faces, view.number, view.foreground)
 
-    def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> Elbows:
+    def _elbows(self, image: Image, faces: Tensor, skin: SkinState, gain: Tensor) -> Elbows:
         """Return the elbows from the clothes, in images scaled such that faces have one size.
+
+        The colours of skin are those of images that were multiplied by the gain of each person.
 
         The scale of a person's image depends on that person's face alone.
         """
 
         def measure(scale: float, rows: Tensor) -> Elbows:
-            return self._elbows_at(image, scale, faces[rows], take_rows(skin, rows))
+            return self._elbows_at(image, scale, faces[rows], take_rows(skin, rows), gain[rows])
 
         return measure_by_scale((_TORSO_FACE / faces[:, 2]).clamp_max(1.0), measure)
 
-    def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> Elbows:
+    def _elbows_at(
+        self, image: Image, scale: float, faces: Tensor, skin: SkinState, gain: Tensor
+    ) -> Elbows:
         """Return the elbows of persons in an image that is made smaller by this factor."""
         import cv2
 
@@ -310,14 +315,20 @@ class UpperBodyMeasurer(nn.Module):
         small = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
         pixels = torch.from_numpy(np.asarray(small)).permute(2, 0, 1)[None].float() / 255
         model = self.hand_tracker.skin
-        bins = model.bins(rgb_to_lab(pixels)).expand(len(faces), -1, -1)
+        lit = (pixels * gain.to(pixels)[:, None, None, None]).clamp_max(1)
+        bins = model.bins(rgb_to_lab(lit))
         shrunk = torch.cat([(faces[:, :2] + 0.5) * scale - 0.5, faces[:, 2:] * scale], 1)
         found = elbows_from_torso(clothes_likelihood(model, skin, bins), shrunk)
         return Elbows((found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen)
 
-    def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen."""
+    def _used(self, tracks: FaceTracks, image: Image) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen.
+
+        A face that has left the image is not measured there any more.
+        """
+        scale, at = _face_scale(image), tracks.mean[:, :2]
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
+        used &= ((at >= 0) & (at < scale * at.new_tensor([image.shape[1], image.shape[0]]))).all(-1)
         rows = torch.nonzero(used).flatten()
         faces = scaled_back(tracks.mean[rows, :3], scale)
         cov = tracks.cov[rows, :3, :3] / scale**2

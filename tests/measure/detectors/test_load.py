@@ -129,6 +129,15 @@ def test_what_a_detector_returns_is_checked(found, said):
         checked_detections(found, 5, "mine")
 
 
+def test_shares_of_the_image_are_no_pixels():
+    shares, sure = np.linspace(0.2, 0.8, 10).reshape(1, 5, 2), np.ones((1, 5))
+    with pytest.raises(InputError, match=r"^mine must return keypoints in pixels, got all of them"):
+        checked_detections((shares, sure), 5, "mine")
+    at_one_place = np.full((1, 5, 2), 0.5), sure  # what a detector may give of an empty image
+    for found in (at_one_place, (shares, 0 * sure), (640 * shares, sure)):
+        assert checked_detections(found, 5, "mine").keypoints.shape == (1, 5, 2)
+
+
 def test_what_is_not_finite_is_missing():
     points, sure = np.ones((1, 5, 2)), np.ones((1, 5), np.float32)
     points[0, 1], sure[0, 2] = np.inf, np.nan

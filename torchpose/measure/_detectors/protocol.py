@@ -12,6 +12,10 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 
 
+_SEVERAL = 3  # keypoints that tell whether all are shares of the image
+_SPREAD = 0.01  # points that are nearer are no body
+
+
 class Detections(NamedTuple):
     """Holds the keypoints of the N persons in a frame.
 
@@ -73,7 +77,7 @@ def checked_detections(found: Any, n_keypoints: int, detector: str) -> Detection
         detector: its name in messages.
 
     Raises:
-        InputError: not a pair, other shapes, no numbers, or a confidence outside 0 to 1.
+        InputError: not a pair, other shapes, no numbers, no pixels, or a confidence outside 0 to 1.
     """
     wanted = f"keypoints [N, {n_keypoints}, 2] and confidence [N, {n_keypoints}] of N persons"
     try:
@@ -92,8 +96,21 @@ def checked_detections(found: Any, n_keypoints: int, detector: str) -> Detection
             f"{detector} must return a confidence in 0 to 1, got {float(confidence[wrong][0]):g}; "
             "scale scores of another range to it"
         )
+    _check_pixels(keypoints[there & (confidence > 0)], detector)
     keypoints = torch.where(there[..., None], keypoints, torch.nan)
     return Detections(keypoints, torch.where(there, confidence, 0.0))
+
+
+def _check_pixels(points: Float[Tensor, "K 2"], detector: str) -> None:
+    """Refuse keypoints that are spread over less than a pixel: shares of the image's sides."""
+    if len(points) < _SEVERAL or bool((points < 0).any() | (points > 1).any()):
+        return
+    if bool((points.amax(0) - points.amin(0) > _SPREAD).all()):
+        raise InputError(
+            f"{detector} must return keypoints in pixels, got all of them between "
+            f"{float(points.min()):.3g} and {float(points.max()):.3g}; multiply shares by the width and "
+            "height of the image"
+        )
 
 
 def _double(values: Any) -> Tensor:
