@@ -13,15 +13,15 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from torchpose._core.terminal import show_progress
+from torchpose._core.files import check_output_folder
+from torchpose._core.terminal import show_progress, without_options
 from torchpose.errors import InputError
 from torchpose.learning._selection import select_n_components
 from train.blocks import Key
-from train.callbacks import FitPictures, FitProgress, PriorWriter
+from train.callbacks import FitPictures, FitProgress, PriorWriter, StopAtOnce
 from train.checkpoints import AtomicCheckpoints, LastCheckpoint, checkpoint_file
 from train.data import RecordingsDataModule
 from train.processes import register_strategy
-from train.stopping import StopAtOnce
 
 __all__ = ["how_to_go_on", "run"]
 
@@ -35,7 +35,8 @@ _DEFAULTS = {
 }
 # how and where a fit runs, not what it makes
 _HOW = (
-    "--trainer",
+    *(f"--trainer.{name}" for name in ("accelerator", "devices", "num_nodes", "strategy")),
+    *(f"--trainer.{name}" for name in ("default_root_dir", "logger", "log_every", "enable_")),
     "--ckpt_path",
     "--pictures",
     "--prior.pictures",
@@ -137,7 +138,6 @@ class _Command(LightningCLI):
         parser.add_lightning_class_args(PriorWriter, "prior")
         parser.add_lightning_class_args(FitPictures, "pictures")
         parser.set_defaults({"model": _MODEL, "data": _DATA})
-        parser.link_arguments("seed_everything", "data.init_args.recipe.seed")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         self.config = parser.parse_args(args)
@@ -155,6 +155,7 @@ class _Command(LightningCLI):
         if self.subcommand == "fit":
             _Command.folder = Path(settings["trainer"]["default_root_dir"])
         _follow_torchrun(settings["trainer"])
+        _take_seed(settings)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         given = self.config_init[self.subcommand]["trainer"]
@@ -169,7 +170,9 @@ class _Command(LightningCLI):
         return super().instantiate_trainer(**kwargs)
 
     def before_fit(self) -> None:
-        """Read and check all recordings before other processes are started."""
+        """See that logs can be written, and read all recordings, before other processes are started."""
+        folder = self.trainer.default_root_dir
+        rank_zero_only(check_output_folder)(folder, "--trainer.default_root_dir")
         self.datamodule.setup("fit")
         report = getattr(self.datamodule, "report", None)
         if report is not None:
@@ -190,17 +193,27 @@ def command_line(arguments: Sequence[str]) -> str:
 
     >>> command_line(["fit", "--config", "a.yaml", "--trainer.devices", "2", "--ckpt_path=last"])
     'python -m train fit --config a.yaml'
+    >>> command_line(["fit", "--config=a.yaml", "--trainer.max_epochs", "3", "--trainer.logger=false"])
+    'python -m train fit --config=a.yaml --trainer.max_epochs 3'
     """
-    kept, skipping = [], False
-    for argument in arguments:
-        if argument.startswith("--"):
-            skipping = argument.startswith(_HOW) and "=" not in argument
-            if argument.startswith(_HOW):
-                continue
-        elif skipping:
-            continue
-        kept.append(argument)
-    return shlex.join(["python", "-m", "train", *kept])
+    return shlex.join(["python", "-m", "train", *without_options(arguments, _HOW)])
+
+
+def _take_seed(settings: Any) -> None:
+    """Give the model, or the recipe of the data, the seed of everything if it has none of its own.
+
+    Raises:
+        InputError: it has another one.
+    """
+    everything = int(settings["seed_everything"])
+    for name in ("model.init_args.seed", "data.init_args.recipe.seed"):
+        own = settings.get(name)
+        if own is not None and everything not in (0, own):
+            if own:
+                raise InputError(
+                    f"seed_everything is {everything}, and {name} is {own}; leave one of them out"
+                )
+            settings[name] = everything
 
 
 def _follow_torchrun(trainer: Any) -> None:

@@ -97,6 +97,30 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
         assert signal.signal(number, handler) in (handler, signal.SIG_IGN)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    ("command", "signum", "said"),
+    [
+        ("fit", signal.SIGTERM, "train: terminated; run the same command again\n"),
+        ("fit", signal.SIGINT, "train: interrupted; run the same command again\n"),
+        ("predict", signal.SIGINT, "train: interrupted; run the same command again to go on\n"),
+    ],
+)
+def test_a_signal_while_modules_are_loaded(monkeypatch, capsys, command, signum, said):
+    name = {"fit": "train.command", "predict": "train.predict"}[command]
+
+    class Finder:
+        @staticmethod
+        def find_spec(module, *_):
+            if module == name:
+                os.kill(os.getpid(), signum)
+
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+    assert main([command]) == 128 + signum
+    assert capsys.readouterr().err == said
+
+
 @pytest.mark.parametrize("grouped", [True, False])
 def test_only_a_process_of_several_ends_without_clearing_up(monkeypatch, grouped):
     ended = []
@@ -130,7 +154,8 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
 
     values = settings(recordings, tmp_path)
     out, last = tmp_path / "p.safetensors", tmp_path / "runs" / "checkpoints" / "last.ckpt"
-    config = write_settings(tmp_path / "final", values)
+    pictures = {"every": 5, "at_end": True, "n_shown": 1}  # at a step, and after the last one
+    config = write_settings(tmp_path / "final", values | {"pictures": pictures})
     kill = {"class_path": "tests.train.people.Kill", "init_args": {"step": 2}}
     values["trainer"]["callbacks"] = [kill]
     dying = write_settings(tmp_path / "dying", values)
@@ -154,3 +179,4 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
     assert prior.info.persons == wanted.info.persons
     logs = sorted(p.name for p in (tmp_path / "runs").iterdir())
     assert logs == ["checkpoints", "version_0", "version_1", "version_2"]
+    assert (tmp_path / "runs" / "version_2" / "pictures" / "likelihood.png").is_file()
