@@ -75,7 +75,7 @@ def _predict(arguments: list[str]) -> int:
 
 
 def _fit(arguments: list[str]) -> int:
-    from train.stopping import signal_of, stopped_by_signals
+    from train.stopping import raise_if_signalled, signal_of, stopped_by_signals
 
     debug = "--debug" in arguments or os.environ.get("TORCHPOSE_DEBUG", "0") not in ("", "0")
     arguments = [a for a in arguments if a != "--debug"]
@@ -83,6 +83,7 @@ def _fit(arguments: list[str]) -> int:
         with stopped_by_signals():
             from train.command import run  # takes seconds
 
+            raise_if_signalled()
             run(arguments)
     except BaseException as error:
         stopped = signal_of(error)

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
-__all__ = ["signal_of", "stopped_by_signals", "terminate"]
+__all__ = ["raise_if_signalled", "signal_of", "stopped_by_signals", "terminate"]
 
 _received: list[int] = []
 
@@ -30,6 +30,12 @@ def terminate(signum: int, _: Any, first: Callable[[], None] = lambda: None) -> 
         raise _Terminated(128 + signum)
 
 
+def _interrupt(signum: int, _: Any) -> None:
+    """Raise what Python raises at Ctrl-C, and remember it."""
+    _received.append(signum)
+    raise KeyboardInterrupt
+
+
 @contextlib.contextmanager
 def stopped_by_signals() -> Iterator[None]:
     """Let SIGTERM end the block by an exception, as Ctrl-C does.
@@ -40,11 +46,20 @@ def stopped_by_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, terminate)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, terminate)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, _interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def raise_if_signalled() -> None:
+    """Raise at a signal whose exception was lost: some modules catch everything while they are loaded."""
+    if _received:
+        raise _Terminated(128 + _received[0])
 
 
 def signal_of(error: BaseException) -> signal.Signals | None:
