@@ -57,7 +57,7 @@ def run(arguments: Sequence[str]) -> None:
     warnings.filterwarnings("ignore", r".*LeafSpec", FutureWarning)
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="lightning|jsonargparse")
     register_strategy()
-    _Command.arguments, _Command.folder = list(arguments), None
+    _Command.arguments, _Command.kept, _Command.resumed = list(arguments), None, False
     quiet: dict[str, Any] = {"exit_on_error": False}
     _Command(
         LightningModule,
@@ -76,8 +76,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def how_to_go_on() -> str:
     """Return how to go on after a command was stopped, in words."""
-    folder = _Command.folder
-    if folder is not None and checkpoint_file(folder).is_file():
+    if _Command.resumed or (_Command.kept is not None and _Command.kept.written):
         return "go on with --ckpt_path last, which takes up the fit after its last step"
     return "no step was finished: run the same command again"
 
@@ -125,7 +124,8 @@ class SelectingTrainer(Trainer):
 
 class _Command(LightningCLI):
     arguments: list[str]
-    folder: Path | None = None
+    kept: LastCheckpoint | None = None  # writes the checkpoints of this run
+    resumed = False
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -152,8 +152,6 @@ class _Command(LightningCLI):
         if not settings["trainer"]["default_root_dir"]:
             name = Path(settings["prior"]["out"]).stem
             settings["trainer"]["default_root_dir"] = str(Path("runs") / name)
-        if self.subcommand == "fit":
-            _Command.folder = Path(settings["trainer"]["default_root_dir"])
         _follow_torchrun(settings["trainer"])
         _take_seed(settings)
 
@@ -163,6 +161,7 @@ class _Command(LightningCLI):
         own = [
             kind() for kind in (LastCheckpoint, FitProgress) if given[_SWITCHES[kind]] is not False
         ]
+        _Command.kept = next((c for c in own if isinstance(c, LastCheckpoint)), None)
         given["callbacks"] = [*callbacks, *own, StopAtOnce()]
         if given["logger"] in (None, True):
             given["logger"] = _loggers(given["default_root_dir"])
@@ -181,7 +180,9 @@ class _Command(LightningCLI):
     def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
         given = super()._prepare_subcommand_kwargs(subcommand)
         if subcommand == "fit":
-            given["ckpt_path"] = _checkpoint(given["ckpt_path"], self.trainer.default_root_dir)
+            folder = self.trainer.default_root_dir
+            given["ckpt_path"] = _checkpoint(given["ckpt_path"], folder)
+            _Command.resumed = given["ckpt_path"] == str(checkpoint_file(folder))
         return given
 
 

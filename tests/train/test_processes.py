@@ -86,6 +86,9 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
             "calibration": "torchpose.learning._recipes.UpperBodyRecipe.hold_out",
         }
         monkeypatch.setattr(where[when], lambda *_, **__: os.kill(os.getpid(), signum))
+    earlier = tmp_path / "runs" / "checkpoints" / "last.ckpt"  # of another run
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("")
     assert main(["fit", "--config", str(write_settings(tmp_path, values))]) == code
     said = capsys.readouterr().err
     if when == "calibration":
