@@ -1,7 +1,10 @@
-"""Show the progress of a fit, draw pictures of it, and write the prior's file."""
+"""Show the progress of a fit, draw pictures of it, write the prior's file, and stop at a signal."""
 
+import signal
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +18,9 @@ from torchpose.learning._fit_files import check_fit_file, fit_results, write_pri
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
+from train.stopping import terminate
 
-__all__ = ["FitPictures", "FitProgress", "PriorWriter"]
+__all__ = ["FitPictures", "FitProgress", "PriorWriter", "StopAtOnce"]
 
 
 class FitProgress(ProgressBar):
@@ -97,11 +101,11 @@ class FitPictures(Callback):
             self._draw(trainer, pl_module)
 
     def _draw(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not trainer.is_global_zero or not isinstance(pl_module, MixtureEM):
+        if not isinstance(pl_module, MixtureEM):
             return
+        folder = trainer.log_dir  # all processes have to ask for it
         step = max(len(history) for history in pl_module.histories.values())
-        folder = trainer.log_dir
-        if folder is None or step == self._drawn_at:
+        if not trainer.is_global_zero or folder is None or step == self._drawn_at:
             return
         self._drawn_at = step
         pictures = Path(folder) / "pictures"
@@ -197,3 +201,21 @@ class PriorWriter(Callback):
     ) -> None:
         """Remove temporary files."""
         self._open.close()
+
+
+class StopAtOnce(Callback):
+    """A callback that keeps SIGTERM from Lightning, which would end the epoch first and exit with code 0.
+
+    The signal is passed on to the other processes that Lightning has started on this machine.
+    """
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Set the handler of the signal again, after Lightning has set its own."""
+        launcher = trainer.strategy.launcher
+
+        def pass_on() -> None:
+            if launcher is not None:
+                launcher.kill(signal.SIGTERM)
+
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, partial(terminate, first=pass_on))

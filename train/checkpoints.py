@@ -35,7 +35,14 @@ def checkpoint_file(folder: str | Path) -> Path:
 
 
 class LastCheckpoint(Checkpoint):
-    """A checkpoint of the whole fit after every step, in `checkpoints/last.ckpt`."""
+    """A checkpoint of the whole fit after every step, in `checkpoints/last.ckpt`.
+
+    Attributes:
+        written: whether this run has written one; there may be one of an earlier run.
+    """
+
+    def __init__(self) -> None:
+        self.written = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Remove temporary files of a killed fit."""
@@ -45,6 +52,7 @@ class LastCheckpoint(Checkpoint):
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the checkpoint."""
         trainer.save_checkpoint(checkpoint_file(trainer.default_root_dir))
+        self.written = True
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

@@ -24,6 +24,7 @@ examples:
   python -m train fit --data.paths '[recordings/]' --prior.out prior.safetensors --ckpt_path auto
   torchrun --nproc-per-node 2 -m train fit --config configs/many-machines.yaml
 """
+_NEEDED = ("lightning", "tensorboard")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,9 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_HELP, end="", file=sys.stdout if command else sys.stderr)
         return 0 if command else 2
     if command == "predict":
-        from train.predict import main as predict
-
-        return predict(arguments[1:])
+        return _predict(arguments[1:])
     if command in ("fit", "select"):
         return _fit(arguments)
     return _refuse(f"unknown command {command!r}; known are fit, select and predict")
@@ -65,22 +64,26 @@ def end_process(status: int) -> NoReturn:
     sys.exit(status)
 
 
+def _predict(arguments: list[str]) -> int:
+    try:
+        from train.predict import main as predict  # takes seconds
+
+        return predict(arguments)
+    except KeyboardInterrupt:
+        print("train: interrupted; run the same command again to go on", file=sys.stderr)
+        return 130
+
+
 def _fit(arguments: list[str]) -> int:
+    from train.stopping import raise_if_signalled, signal_of, stopped_by_signals
+
     debug = "--debug" in arguments or os.environ.get("TORCHPOSE_DEBUG", "0") not in ("", "0")
     arguments = [a for a in arguments if a != "--debug"]
     try:
-        from train.command import run
-    except ModuleNotFoundError as error:
-        if debug or (error.name or "").partition(".")[0] not in ("lightning", "tensorboard"):
-            raise
-        return _refuse(
-            f"training needs {error.name}; run `python -m pip install -e '.[train]'` in the checkout"
-        )
-    from train.refusals import reason
-    from train.stopping import signal_of, stopped_by_signals
-
-    try:
         with stopped_by_signals():
+            from train.command import run  # takes seconds
+
+            raise_if_signalled()
             run(arguments)
     except BaseException as error:
         stopped = signal_of(error)
@@ -88,20 +91,32 @@ def _fit(arguments: list[str]) -> int:
             return _stop(stopped)
         if isinstance(error, SystemExit):  # --help and --print_config
             return error.code if isinstance(error.code, int) else 0
-        text = None if debug else reason(error, arguments)
+        text = None if debug else _reason(error, arguments)
         if text is None:
             raise
         return _refuse(text)
     return 0
 
 
+def _reason(error: BaseException, arguments: list[str]) -> str | None:
+    """Return what was wrong, in one sentence, or None if it was nothing that the user gave."""
+    if isinstance(error, ModuleNotFoundError):
+        missing = error.name if (error.name or "").partition(".")[0] in _NEEDED else None
+        return missing and (
+            f"training needs {missing}; run `python -m pip install -e '.[train]'` in the checkout"
+        )
+    from train.refusals import reason
+
+    return reason(error, arguments)
+
+
 def _stop(stopped: signal.Signals) -> int:
     """Say how to resume, and return the exit code that shells give to a process ended by a signal."""
-    from train.command import how_to_go_on
-
+    command = sys.modules.get("train.command")  # not yet there if it was stopped while loading
+    how = "run the same command again" if command is None else command.how_to_go_on()
     if _rank() == "0":
         what = "interrupted" if stopped == signal.SIGINT else "terminated"
-        print(f"train: {what}; {how_to_go_on()}", file=sys.stderr)
+        print(f"train: {what}; {how}", file=sys.stderr)
     return 128 + stopped
 
 

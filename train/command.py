@@ -13,15 +13,15 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from torchpose._core.terminal import show_progress
+from torchpose._core.files import check_output_folder
+from torchpose._core.terminal import show_progress, without_options
 from torchpose.errors import InputError
 from torchpose.learning._selection import select_n_components
 from train.blocks import Key
-from train.callbacks import FitPictures, FitProgress, PriorWriter
+from train.callbacks import FitPictures, FitProgress, PriorWriter, StopAtOnce
 from train.checkpoints import AtomicCheckpoints, LastCheckpoint, checkpoint_file
 from train.data import RecordingsDataModule
 from train.processes import register_strategy
-from train.stopping import StopAtOnce
 
 __all__ = ["how_to_go_on", "run"]
 
@@ -35,7 +35,8 @@ _DEFAULTS = {
 }
 # how and where a fit runs, not what it makes
 _HOW = (
-    "--trainer",
+    *(f"--trainer.{name}" for name in ("accelerator", "devices", "num_nodes", "strategy")),
+    *(f"--trainer.{name}" for name in ("default_root_dir", "logger", "log_every", "enable_")),
     "--ckpt_path",
     "--pictures",
     "--prior.pictures",
@@ -56,7 +57,7 @@ def run(arguments: Sequence[str]) -> None:
     warnings.filterwarnings("ignore", r".*LeafSpec", FutureWarning)
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="lightning|jsonargparse")
     register_strategy()
-    _Command.arguments, _Command.folder = list(arguments), None
+    _Command.arguments, _Command.kept, _Command.resumed = list(arguments), None, False
     quiet: dict[str, Any] = {"exit_on_error": False}
     _Command(
         LightningModule,
@@ -75,8 +76,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def how_to_go_on() -> str:
     """Return how to go on after a command was stopped, in words."""
-    folder = _Command.folder
-    if folder is not None and checkpoint_file(folder).is_file():
+    if _Command.resumed or (_Command.kept is not None and _Command.kept.written):
         return "go on with --ckpt_path last, which takes up the fit after its last step"
     return "no step was finished: run the same command again"
 
@@ -124,7 +124,8 @@ class SelectingTrainer(Trainer):
 
 class _Command(LightningCLI):
     arguments: list[str]
-    folder: Path | None = None
+    kept: LastCheckpoint | None = None  # writes the checkpoints of this run
+    resumed = False
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -137,7 +138,6 @@ class _Command(LightningCLI):
         parser.add_lightning_class_args(PriorWriter, "prior")
         parser.add_lightning_class_args(FitPictures, "pictures")
         parser.set_defaults({"model": _MODEL, "data": _DATA})
-        parser.link_arguments("seed_everything", "data.init_args.recipe.seed")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         self.config = parser.parse_args(args)
@@ -152,9 +152,8 @@ class _Command(LightningCLI):
         if not settings["trainer"]["default_root_dir"]:
             name = Path(settings["prior"]["out"]).stem
             settings["trainer"]["default_root_dir"] = str(Path("runs") / name)
-        if self.subcommand == "fit":
-            _Command.folder = Path(settings["trainer"]["default_root_dir"])
         _follow_torchrun(settings["trainer"])
+        _take_seed(settings)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         given = self.config_init[self.subcommand]["trainer"]
@@ -162,6 +161,7 @@ class _Command(LightningCLI):
         own = [
             kind() for kind in (LastCheckpoint, FitProgress) if given[_SWITCHES[kind]] is not False
         ]
+        _Command.kept = next((c for c in own if isinstance(c, LastCheckpoint)), None)
         given["callbacks"] = [*callbacks, *own, StopAtOnce()]
         if given["logger"] in (None, True):
             given["logger"] = _loggers(given["default_root_dir"])
@@ -169,7 +169,9 @@ class _Command(LightningCLI):
         return super().instantiate_trainer(**kwargs)
 
     def before_fit(self) -> None:
-        """Read and check all recordings before other processes are started."""
+        """See that logs can be written, and read all recordings, before other processes are started."""
+        folder = self.trainer.default_root_dir
+        rank_zero_only(check_output_folder)(folder, "--trainer.default_root_dir")
         self.datamodule.setup("fit")
         report = getattr(self.datamodule, "report", None)
         if report is not None:
@@ -178,7 +180,9 @@ class _Command(LightningCLI):
     def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
         given = super()._prepare_subcommand_kwargs(subcommand)
         if subcommand == "fit":
-            given["ckpt_path"] = _checkpoint(given["ckpt_path"], self.trainer.default_root_dir)
+            folder = self.trainer.default_root_dir
+            given["ckpt_path"] = _checkpoint(given["ckpt_path"], folder)
+            _Command.resumed = given["ckpt_path"] == str(checkpoint_file(folder))
         return given
 
 
@@ -190,17 +194,27 @@ def command_line(arguments: Sequence[str]) -> str:
 
     >>> command_line(["fit", "--config", "a.yaml", "--trainer.devices", "2", "--ckpt_path=last"])
     'python -m train fit --config a.yaml'
+    >>> command_line(["fit", "--config=a.yaml", "--trainer.max_epochs", "3", "--trainer.logger=false"])
+    'python -m train fit --config=a.yaml --trainer.max_epochs 3'
     """
-    kept, skipping = [], False
-    for argument in arguments:
-        if argument.startswith("--"):
-            skipping = argument.startswith(_HOW) and "=" not in argument
-            if argument.startswith(_HOW):
-                continue
-        elif skipping:
-            continue
-        kept.append(argument)
-    return shlex.join(["python", "-m", "train", *kept])
+    return shlex.join(["python", "-m", "train", *without_options(arguments, _HOW)])
+
+
+def _take_seed(settings: Any) -> None:
+    """Give the model, or the recipe of the data, the seed of everything if it has none of its own.
+
+    Raises:
+        InputError: it has another one.
+    """
+    everything = int(settings["seed_everything"])
+    for name in ("model.init_args.seed", "data.init_args.recipe.seed"):
+        own = settings.get(name)
+        if own is not None and everything not in (0, own):
+            if own:
+                raise InputError(
+                    f"seed_everything is {everything}, and {name} is {own}; leave one of them out"
+                )
+            settings[name] = everything
 
 
 def _follow_torchrun(trainer: Any) -> None:

@@ -155,6 +155,8 @@ def split(
 ) -> tuple[list[Recording], list[Recording]]:
     """Split recordings into those to fit to and those of held-out persons.
 
+    Other people in the file of a held-out person are on neither side, because nobody says who they are.
+
     Args:
         recordings: of everybody. persons: to fit to; all others than those held out if None.
         held_out: persons that are not fitted to.
@@ -174,8 +176,11 @@ def split(
         raise InputError(
             f"nobody is left to fit to: all of {', '.join(known)} are held out; hold fewer out"
         )
-    train = [r for r in recordings if r.person_id in fitted]
     watched = [r for r in recordings if r.person_id in out]
+    files = {r.path for r in watched if r.path is not None}
+    train = [
+        r for r in recordings if r.person_id in fitted and not (r.companion and r.path in files)
+    ]
     refuse_leaks(train, watched)
     return train, watched
 

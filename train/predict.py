@@ -40,7 +40,10 @@ _RANKS = (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command: 0 done; 1 done, but some recordings are not; 2 refused, with one line why."""
+    """Run the command: 0 done; 1 done, but some recordings are not; 2 refused, with one line why.
+
+    Ctrl-C is left to `train.cli.main`.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     try:
@@ -53,9 +56,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )  # fmt: skip
     except SystemExit as stop:  # --help and --print_config
         return stop.code if isinstance(stop.code, int) else 0
-    except KeyboardInterrupt:
-        print("train: interrupted; run the same command again to go on", file=sys.stderr)
-        return 130
     except (ArgumentError, TorchposeError) as error:
         if debug:
             raise

@@ -1,5 +1,6 @@
 """Describe errors in what the user gave in one sentence that names the key and the file."""
 
+import errno
 import itertools
 import re
 import textwrap
@@ -26,6 +27,10 @@ _REQUIRED = r"arguments are required: ([\w., ]+)"
 _CLASS = r"Problem with given class_path '[^']+':\s*"
 _KEY = r'Parser key "([\w.]+)":\s*'
 _SETTINGS = "accelerator_connector"  # where Lightning looks at devices and strategies
+_SEED = "seed.py"  # where it looks at seeds
+_REFUSED = (  # by the system: rights, a full disk
+    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENOSPC, errno.EPERM, errno.EROFS,
+)  # fmt: skip
 
 
 def reason(error: BaseException, arguments: Sequence[str]) -> str | None:
@@ -41,6 +46,12 @@ def reason(error: BaseException, arguments: Sequence[str]) -> str | None:
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, ValueError) and frames and _SETTINGS in frames[-1].filename:
         return one_line(error)
+    if isinstance(error, ValueError) and frames and frames[-1].filename.endswith(_SEED):
+        return f"seed_everything: {one_line(error)}"
+    if isinstance(error, UnicodeDecodeError) and _files(arguments):
+        return f"{', '.join(map(str, _files(arguments)))}: expected UTF-8, got bytes that are none"
+    if isinstance(error, OSError) and error.errno in _REFUSED:
+        return f"{error.filename or 'logs'}: cannot be read or written ({error.strerror})"
     if isinstance(error, torch.distributed.DistError) or "gloo" in str(error):
         return "another process has gone, see its messages; go on with --ckpt_path last"
     return None

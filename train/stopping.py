@@ -1,14 +1,15 @@
-"""End a command on SIGTERM and Ctrl-C with the exit code that shells and schedulers expect."""
+"""End a command on SIGTERM and Ctrl-C with the exit code that shells and schedulers expect.
+
+Nothing here needs Lightning, which takes seconds to load: a signal that comes meanwhile is heard too.
+"""
 
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from lightning.pytorch import Callback, LightningModule, Trainer
-
-__all__ = ["StopAtOnce", "signal_of", "stopped_by_signals"]
+__all__ = ["raise_if_signalled", "signal_of", "stopped_by_signals", "terminate"]
 
 _received: list[int] = []
 
@@ -17,11 +18,22 @@ class _Terminated(SystemExit):
     """The exit that is raised wherever the process is when SIGTERM comes."""
 
 
-def _terminate(signum: int, _: Any) -> None:
-    """Raise on the first signal only, so that cleaning up is not interrupted."""
+def terminate(signum: int, _: Any, first: Callable[[], None] = lambda: None) -> None:
+    """Raise on the first signal only, so that cleaning up is not interrupted.
+
+    Args:
+        signum: of the signal. first: is called before.
+    """
     _received.append(signum)
     if len(_received) == 1:
+        first()
         raise _Terminated(128 + signum)
+
+
+def _interrupt(signum: int, _: Any) -> None:
+    """Raise what Python raises at Ctrl-C, and remember it."""
+    _received.append(signum)
+    raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
@@ -34,11 +46,20 @@ def stopped_by_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, terminate)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, _interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def raise_if_signalled() -> None:
+    """Raise at a signal whose exception was lost: some modules catch everything while they are loaded."""
+    if _received:
+        raise _Terminated(128 + _received[0])
 
 
 def signal_of(error: BaseException) -> signal.Signals | None:
@@ -51,22 +72,3 @@ def signal_of(error: BaseException) -> signal.Signals | None:
         return signal.Signals(_received[0])
     interrupted = error.__context__ if isinstance(error, SystemExit) else error
     return signal.SIGINT if isinstance(interrupted, KeyboardInterrupt) else None
-
-
-class StopAtOnce(Callback):
-    """A callback that keeps SIGTERM from Lightning, which would end the epoch first and exit with code 0.
-
-    The signal is passed on to the other processes that Lightning has started on this machine.
-    """
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Set the handler of the signal again, after Lightning has set its own."""
-        launcher = trainer.strategy.launcher
-
-        def terminate(signum: int, frame: Any) -> None:
-            if launcher is not None and not _received:
-                launcher.kill(signal.Signals(signum))
-            _terminate(signum, frame)
-
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, terminate)

@@ -113,6 +113,8 @@ def test_persons_are_left_out_by_name(torchpose, files, tmp_path):
     assert "no person was held out" in out.with_suffix(".md").read_text()
     refused = torchpose(*line[:-1], "p9")
     assert refused.code == 2 and "recordings#p1, recordings#p2" in refused.err
+    nobody = torchpose(*line, "p1")
+    assert nobody.code == 2 and "--without leaves nobody to fit to" in nobody.err
 
 
 def test_what_jumps_is_left_out_and_said(torchpose, files, tmp_path):
@@ -148,6 +150,12 @@ def test_config_file_round_trip(torchpose, files, tmp_path):
     done = torchpose("fit", "--config", tmp_path / "fit.yaml")
     assert done.code == 0, done.err
     assert load_prior(out).n_components == 2
+
+
+def test_a_configuration_in_other_bytes_is_refused(torchpose, tmp_path):
+    (tmp_path / "fit.yaml").write_bytes(b"name: Andr\xe9\n")
+    refused = torchpose("fit", "--config", tmp_path / "fit.yaml")
+    assert refused.code == 2 and "fit.yaml: expected text in UTF-8" in refused.err
 
 
 BAD_INPUT = {

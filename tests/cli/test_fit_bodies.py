@@ -233,6 +233,10 @@ def test_a_configuration_names_the_command(torchpose, walks, tmp_path):
     assert torchpose("fit", "limbs", "--config", config).code == 0
     info = LimbConditionals.load(tmp_path / "x.safetensors").info
     assert info.command == f"torchpose fit limbs --config {config}"
+    other = ("--out", tmp_path / "y.safetensors", "--fps", 30)
+    assert torchpose("fit", "limbs", "--config", config, *other).code == 0
+    info = LimbConditionals.load(tmp_path / "y.safetensors").info
+    assert info.command == f"torchpose fit limbs --config {config} --fps 30"
     given = command("limbs").given([*(f"r{i}" for i in range(20)), "--out", "a/x.safetensors"])
     assert recorded_command(given) == "torchpose fit limbs r0 '...19 more' --out x.safetensors"
 

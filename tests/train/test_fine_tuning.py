@@ -59,8 +59,9 @@ def scene(tmp_path_factory) -> SimpleNamespace:
     seen = [r for r in recordings if r.person_id != "set#p2"]
     recipe.fit(seen, name="windows").save(home / "windows.safetensors")
     base = load_prior(home / "windows.safetensors")
-    info = replace(base.info, name="base", extra={})
+    info = replace(base.info, name="base", extra={"held_out_drawn": {"pf_walk": {"set#p0": 0.1}}})
     noise = base.noise | {"process_cov": released_process_cov()}  # far from the best
+    noise |= {f"calibration_{kind}_pf_walk": torch.ones(8) for kind in ("scale", "floor")}
     UpperBodyPrior(base.left, base.right, info, noise).save(home / "base.safetensors")
     options = {
         "--model.init_args.prior": home / "base.safetensors",
@@ -116,6 +117,8 @@ def test_noise_is_tuned_and_the_file_says_so(scene, whole) -> None:
     assert facts["settings"]["part"] == "poses" and facts["steps"] in (2, 4, 6)
     assert facts["error_after"]["pose"] < facts["error_before"]["pose"]
     assert {"calibration_scale_pose", "calibration_floor_pose"} <= set(whole.noise)
+    assert "calibration_scale_pf_walk" not in whole.noise  # of the prior to start from
+    assert "held_out_drawn" not in whole.info.extra
     assert (scene.home / "whole.md").is_file()
     assert not [p for p in scene.home.glob(".*") if p.suffix != ".json"]
     log = (scene.home / "runs" / "whole" / "version_0" / "metrics.csv").read_text()

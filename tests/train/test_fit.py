@@ -1,7 +1,9 @@
 """`python -m train fit` in this process: the prior, its logs, and what it refuses."""
 
 import csv
+import errno
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +17,8 @@ from torchpose.learning._curation import CurationSettings, curate
 from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import load_prior
 from train.cli import main
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +187,16 @@ REFUSED = {
     "precision": ({}, ["--trainer.precision", "16-true"], "double precision"),
     "strategy": ({}, ["--trainer.strategy", "none"], "invalid strategy"),
     "components": ({}, ["--data.recipe.n_components", "9001"], "mixture 'pose': "),
+    "seed": ({}, ["--seed_everything", "-1"], "seed_everything: -1 is not in bounds"),
+    "two seeds": (
+        {}, ["--seed_everything", "1", "--data.recipe.seed", "2"],
+        "seed_everything is 1, and data.init_args.recipe.seed is 2; leave one",
+    ),
+    "logs": (
+        {}, ["--trainer.default_root_dir", "{tmp}/fit.yaml"],
+        "fit.yaml: results cannot be written to this folder (File exists); choose another with "
+        "--trainer.default_root_dir",
+    ),
 }  # fmt: skip
 
 
@@ -191,12 +205,57 @@ def test_refusals(case, recordings, tmp_path, capsys):
     changes, options, message = REFUSED[case]
     values = settings(recordings, tmp_path)
     merge(values, changes)
+    options = [option.format(tmp=tmp_path) for option in options]
     line = ["fit", "--config", str(write_settings(tmp_path, values)), *options]
     code = main(line)
     printed = capsys.readouterr().err.strip()
     assert code == 2 and message in printed, printed
     assert len(printed.splitlines()) == 1 and printed.startswith("train: error: ")
     assert not list(tmp_path.glob("p.*"))
+
+
+SEEDS = {
+    "default": ([], 0),
+    "everything": (["--seed_everything", "7"], 7),
+    "own": (["{own}", "7"], 7),
+    "both alike": (["--seed_everything", "7", "{own}", "7"], 7),
+}
+
+
+@pytest.mark.parametrize("case", SEEDS)
+@pytest.mark.parametrize("config", ["newcomer", "fine-tune", "manifold", "actions", "body"])
+def test_one_seed(config, case, monkeypatch):
+    """It reaches what is fitted, whichever key names it."""
+    options, wanted = SEEDS[case]
+    own = "--data.recipe.seed" if config == "newcomer" else "--model.init_args.seed"
+    found = []
+
+    def stop(command):
+        recipe = getattr(command.datamodule, "recipe", None)
+        found.append(command.model.hparams["seed"] if recipe is None else recipe.seed)
+        raise SystemExit(0)
+
+    monkeypatch.setattr("train.command._Command.before_fit", stop)
+    options = [option.format(own=own) for option in options]
+    assert main(["fit", "--config", str(ROOT / "configs" / f"{config}.yaml"), *options]) == 0
+    assert found == [wanted]
+
+
+def test_what_cannot_be_read_or_written_is_said(recordings, tmp_path, monkeypatch, capsys):
+    (tmp_path / "latin.yaml").write_bytes(b"prior:\n  out: \xe9.safetensors\n")
+    assert main(["fit", "--config", str(tmp_path / "latin.yaml")]) == 2
+    assert "latin.yaml: expected UTF-8" in capsys.readouterr().err
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "metrics.csv")
+
+    monkeypatch.setattr("lightning.pytorch.loggers.CSVLogger.save", full)
+    config = write_settings(tmp_path, settings(recordings, tmp_path))
+    assert main(["fit", "--config", str(config)]) == 2
+    printed = capsys.readouterr().err
+    assert printed == (
+        "train: error: metrics.csv: cannot be read or written (No space left on device)\n"
+    )
 
 
 def test_a_neighbour_of_another_kind_is_not_replaced(recordings, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """The module by itself: devices it refuses, states that are bad, data that are none of its own."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -133,6 +134,16 @@ def test_split_by_person():
     twin.joints = recordings[1].joints.clone()
     with pytest.raises(OverlapError):
         split([*recordings, twin], None, ["d"])
+
+
+def test_other_people_in_the_file_of_a_held_out_person_are_on_neither_side():
+    alice, friend, bob, other = people("a", "a", "b", "b")
+    for recording, file in ((alice, "a"), (friend, "a"), (bob, "b"), (other, "b")):
+        recording.path = Path(f"{file}.csv")
+    friend.companion = other.companion = 1
+    train, watched = split([alice, friend, bob, other], None, ["a"])
+    assert [r.person_id for r in train] == ["x#b", "x#b+1"]
+    assert [r.person_id for r in watched] == ["x#a"]
 
 
 def test_held_out_persons_have_the_neck_of_the_training(tmp_path):

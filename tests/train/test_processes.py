@@ -1,5 +1,6 @@
 """Real processes: killed in the middle of a step, resumed, two of them, by Lightning and by torchrun."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -85,6 +86,9 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
             "calibration": "torchpose.learning._recipes.UpperBodyRecipe.hold_out",
         }
         monkeypatch.setattr(where[when], lambda *_, **__: os.kill(os.getpid(), signum))
+    earlier = tmp_path / "runs" / "checkpoints" / "last.ckpt"  # of another run
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("")
     assert main(["fit", "--config", str(write_settings(tmp_path, values))]) == code
     said = capsys.readouterr().err
     if when == "calibration":
@@ -95,6 +99,37 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
     assert {p.name for p in tmp_path.iterdir()} <= {"fit.yaml", "runs"}
     for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
         assert signal.signal(number, handler) in (handler, signal.SIG_IGN)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    ("command", "signum", "lost"),
+    [
+        ("fit", signal.SIGTERM, False),
+        ("fit", signal.SIGINT, False),
+        ("fit", signal.SIGTERM, True),
+        ("fit", signal.SIGINT, True),
+        ("predict", signal.SIGINT, False),
+    ],
+)
+def test_a_signal_while_modules_are_loaded(monkeypatch, capsys, command, signum, lost):
+    """Some modules catch everything, and the exception is lost."""
+    name = {"fit": "train.command", "predict": "train.predict"}[command]
+
+    class Finder:
+        @staticmethod
+        def find_spec(module, *_):
+            if module == name:
+                with contextlib.suppress(BaseException if lost else ()):
+                    os.kill(os.getpid(), signum)
+
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+    assert main([command]) == 128 + signum
+    what = "terminated" if signum == signal.SIGTERM else "interrupted"
+    said = capsys.readouterr().err
+    assert said.startswith(f"train: {what}; ") and len(said.splitlines()) == 1
+    assert "run the same command again" in said
 
 
 @pytest.mark.parametrize("grouped", [True, False])
@@ -130,7 +165,8 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
 
     values = settings(recordings, tmp_path)
     out, last = tmp_path / "p.safetensors", tmp_path / "runs" / "checkpoints" / "last.ckpt"
-    config = write_settings(tmp_path / "final", values)
+    pictures = {"every": 5, "at_end": True, "n_shown": 1}  # at a step, and after the last one
+    config = write_settings(tmp_path / "final", values | {"pictures": pictures})
     kill = {"class_path": "tests.train.people.Kill", "init_args": {"step": 2}}
     values["trainer"]["callbacks"] = [kill]
     dying = write_settings(tmp_path / "dying", values)
@@ -154,3 +190,4 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
     assert prior.info.persons == wanted.info.persons
     logs = sorted(p.name for p in (tmp_path / "runs").iterdir())
     assert logs == ["checkpoints", "version_0", "version_1", "version_2"]
+    assert (tmp_path / "runs" / "version_2" / "pictures" / "likelihood.png").is_file()

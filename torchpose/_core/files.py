@@ -132,8 +132,11 @@ def _make(temporary: Path, path: Path) -> int:
         os.close(handle)  # another process took it for a leftover before it was locked
 
 
-def check_output_folder(folder: str | Path) -> Path:
+def check_output_folder(folder: str | Path, option: str = "--out") -> Path:
     """Make the folder if need be, see that files can be written there, clear what killed runs left.
+
+    Args:
+        folder: of results. option: that names another one.
 
     Raises:
         OutputError: it is a file, cannot be made, or is not writable.
@@ -147,7 +150,7 @@ def check_output_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise OutputError(
             f"{folder}: results cannot be written to this folder ({error.strerror or error}); "
-            "choose another with --out"
+            f"choose another with {option}"
         ) from error
     return folder
 

@@ -1,7 +1,8 @@
-"""Print errors on one line, and progress bars only to a terminal."""
+"""Print errors on one line, progress bars only to a terminal, and commands without some options."""
 
 import re
 import sys
+from collections.abc import Sequence
 
 from torchpose.errors import printable
 
@@ -24,3 +25,18 @@ def one_line(error: BaseException) -> str:
 def show_progress() -> bool:
     """Return whether progress bars are shown: standard error is a terminal."""
     return sys.stderr.isatty()
+
+
+def without_options(arguments: Sequence[str], options: tuple[str, ...]) -> list[str]:
+    """Return arguments of a command without the options that begin with some words, and their values.
+
+    >>> without_options(["--out", "b", "a/", "--seed", "1", "--pictures=false"], ("--out", "--pictures"))
+    ['a/', '--seed', '1']
+    """
+    before = ["", *arguments]
+    return [
+        argument
+        for last, argument in zip(before, arguments, strict=False)
+        if not argument.startswith(options)
+        and (argument.startswith("--") or not last.startswith(options) or "=" in last)
+    ]

@@ -40,12 +40,13 @@ class Given(NamedTuple):
 
     Attributes:
         words: after the program, such as ("fit", "limbs"). values: of all options by key.
-        defaults: the defaults of the options.
+        defaults: the defaults of the options. typed: what stood after `words`.
     """
 
     words: tuple[str, ...]
     values: dict[str, Any]
     defaults: dict[str, Any]
+    typed: tuple[str, ...] = ()
 
     def files(self, output: str = "out") -> list[Path]:
         """Return the files that options name, that of the output apart."""
@@ -140,7 +141,8 @@ class Command(NamedTuple):
         for option in self.own:  # what may be left out is not read from a configuration by itself
             if option.positional and values[option.key] is None and values["config"]:
                 values[option.key] = parser.parse_path(values["config"][-1])[option.key]
-        return Given(tuple(self.name.split()), values, vars(parser.get_defaults()))
+        words = tuple(self.name.split())
+        return Given(words, values, vars(parser.get_defaults()), tuple(arguments))
 
     def main(self, arguments: Sequence[str]) -> int:
         """Run the command and return its exit code."""
@@ -176,11 +178,24 @@ def new_parser(
     )
     parser.add_argument(
         "--config",
-        action=ActionConfigFile,
+        action=_ConfigFile,
         metavar="FILE",
         help="options as YAML, as --print_config writes them; what follows it on the line wins",
     )
     return parser
+
+
+class _ConfigFile(ActionConfigFile):
+    """Reads --config; bytes that are no text are an error of the argument."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, *others: Any) -> None:
+        try:
+            super().__call__(parser, namespace, values, *others)
+        except UnicodeDecodeError as error:
+            raise ArgumentError(
+                None,
+                f"--config {values}: expected text in UTF-8, got bytes that are none ({error.reason})",
+            ) from error
 
 
 def add_options(

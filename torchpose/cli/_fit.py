@@ -187,7 +187,10 @@ def _without(recordings: list["Recording"], persons: list[str]) -> list["Recordi
     """Return the recordings of everybody else."""
     from torchpose.learning._curation.splits import pick_persons
 
-    out = pick_persons(persons, sorted({r.person_id for r in recordings}))
+    known = sorted({r.person_id for r in recordings})
+    out = pick_persons(persons, known)
+    if out == set(known):
+        raise InputError(f"--without leaves nobody to fit to, of {', '.join(known)}; name fewer")
     return [r for r in recordings if r.person_id not in out]
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpose._core.terminal import show_progress
+from torchpose._core.terminal import show_progress, without_options
 from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible
 from torchpose.cli._options import Option, options_of
@@ -55,9 +55,8 @@ def command(kind: str) -> Command:
 def recorded_command(given: Given) -> str:
     """Return the command as the model's file says it."""
     if given.values["config"]:
-        return shlex.join(
-            ["torchpose", *given.words, "--config", *map(str, given.values["config"])]
-        )
+        typed = without_options(given.typed, ("--out", "--pictures"))
+        return shlex.join(["torchpose", *given.words, *typed])
     return given.line(Path(given.values["out"]).name)
 
 

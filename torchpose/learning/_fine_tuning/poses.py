@@ -181,9 +181,16 @@ class TunableKalman(nn.Module):
         return _mean_error(self(batch)[0], batch.poses, batch.inside)
 
     def prior(self) -> UpperBodyPrior:
-        """Return the prior at the current parameters."""
+        """Return the prior at the current parameters.
+
+        It has no calibration over single poses: those of the prior to start from were of other parameters.
+        """
         start = self._prior[0]
-        noise = {name: value.clone() for name, value in start.noise.items()}
+        noise = {
+            name: value.clone()
+            for name, value in start.noise.items()
+            if not name.startswith("calibration_") or name.split("_", 2)[2] in start.windows
+        }
         for side in ARMS:
             noise.pop(f"process_cov_{side}", None)
         noise["process_cov"] = self.process().detach()
