@@ -4,8 +4,6 @@ import numpy as np
 
 from torchpose._core.images import Image
 
-__all__ = ["brightened", "gain_to"]
-
 _MOST_GAIN = 6.0
 
 

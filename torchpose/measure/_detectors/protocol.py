@@ -11,7 +11,6 @@ from torch import Tensor
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 
-
 _SEVERAL = 3  # keypoints that tell whether all are shares of the image
 _SPREAD = 0.01  # points that are nearer are no body
 
