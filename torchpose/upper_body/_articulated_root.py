@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.math._rotations import within_half_turn
@@ -55,6 +55,20 @@ class Roots(NamedTuple):
         return Root(depth, turn, size, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
 
+class _Weighed(NamedTuple):
+    """Arms given each of M hypotheses of the root.
+
+    Attributes:
+        middle, shoulders: the middle of the shoulders, [B, M, 3], and their places, [B, 2, M, 3].
+        arms: the hypotheses about both arms. evidence: the log-evidence of both, [B, M].
+    """
+
+    middle: Tensor
+    shoulders: Tensor
+    arms: Arms
+    evidence: Tensor
+
+
 class RootStep(NamedTuple):
     """Measurement update of the torso, with the arms given it.
 
@@ -73,7 +87,8 @@ class RootStep(NamedTuple):
         frame: UprightFrame,
         last: Tensor,
         sizes: Sizes,
-        power: float,
+        power: Float[Tensor, " B"],
+        fresh: Bool[Tensor, " B"] | None,
     ) -> tuple[Float[Tensor, "B S Z P"], Roots]:
         """Return the posterior over the grid and the likeliest hypotheses.
 
@@ -81,6 +96,8 @@ class RootStep(NamedTuple):
             belief: the belief at the last update. frame: the measurements, in tilted axes.
             last: the middle of the shoulders in the frame before, in the same axes, [B, 3].
             sizes: the lengths of the bones. power: the exponent of the likelihood.
+            fresh: whose arms are seen for the first time with a torso, so that the depths at which they
+                cannot be are ruled out before the likeliest hypotheses are picked; None is nobody.
         """
         likelihood = self.grid.likelihood(frame.torso, sizes.torso, power)
         believed = self.grid.predict(belief) * likelihood
@@ -88,17 +105,30 @@ class RootStep(NamedTuple):
             std = frame.given.std.amin(1)
             of_face = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
             believed = believed * of_face[:, None].exp()
+        if fresh is not None:
+            far = self.grid.at_all_depths(believed)
+            against = self.grid.ruled_out(self._weighed(frame, far, last, sizes).evidence)
+            against = torch.where(fresh[:, None, None], against, 0.0)
+            believed = believed * against.exp()[:, None]
         root = self.grid.best(believed, _ROOTS)
+        middle, shoulders, arms, evidence = self._weighed(frame, root, last, sizes)
+        evidence = power[:, None] * evidence
+        if fresh is not None:  # in place of what was said against them
+            evidence = evidence - against.flatten(1).gather(1, root.cell)
+        belief = self.grid.belief(believed, root, evidence, frame.given.extrapolates)
+        root = root._replace(log_weight=root.log_weight + evidence)
+        return belief, Roots(root, _shares_of_mode(root), middle, shoulders, arms.mean_directions)
+
+    def _weighed(
+        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
+    ) -> _Weighed:
+        """Return the arms given each hypothesis of the root, and their log-evidence."""
         middle = self.middle(frame.torso, root, last, sizes)
         shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
         arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
         seen = frame.given.limbs.sum((1, 2)).to(root.depth)
-        evidence = power * (
-            self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
-        )
-        belief = self.grid.belief(believed, root, evidence, frame.given.extrapolates)
-        root = root._replace(log_weight=root.log_weight + evidence)
-        return belief, Roots(root, _shares_of_mode(root), middle, shoulders, arms.mean_directions)
+        evidence = self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
+        return _Weighed(middle, shoulders, arms, evidence)
 
     def middle(
         self, torso: Torso, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
