@@ -73,9 +73,16 @@ def test_depths_at_which_arms_cannot_be_are_ruled_out(grid):
     root = grid.at_all_depths(belief)
     assert root.depth[0, ::2].tolist() == root.depth[0, 1::2].tolist() == grid.depth[::4].tolist()
     assert bool((root.turn[:, ::2] < 0).all() and (root.turn[:, 1::2] >= 0).all())
-    said = -0.5 * ((root.depth / 2.0).log() / 0.05).square()
-    against = grid.ruled_out(said)
+    said = -0.5 * ((root.depth / 2.0).log() / 0.07).square()
+    both = torch.tensor([[True, True]])
+    against = grid.ruled_out(said[:, None].expand(-1, 2, -1), both)
     assert against.shape == belief[:, 0].shape
     near = (grid.depth / 2.0).log().abs() < 0.15
     assert float(against[:, near].abs().max()) == 0.0
     assert float(against[:, grid.depth > 5.0].max()) < -20.0
+    # an arm whose hand is an outlier says nothing alone; one that is the only one does
+    misled = -0.5 * ((root.depth / 0.8).log() / 0.07).square()
+    apart = torch.stack([0 * said, misled], 1)
+    assert float(grid.ruled_out(apart, both).abs().max()) == 0.0
+    alone = grid.ruled_out(apart, torch.tensor([[False, True]]))
+    assert float(alone[:, grid.depth > 2.0].max()) < -5.0

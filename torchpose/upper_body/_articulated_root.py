@@ -60,13 +60,15 @@ class _Weighed(NamedTuple):
 
     Attributes:
         middle, shoulders: the middle of the shoulders, [B, M, 3], and their places, [B, 2, M, 3].
-        arms: the hypotheses about both arms. evidence: the log-evidence of both, [B, M].
+        arms: the hypotheses about both arms.
+        evidence: the log-evidence of both together, [B, M]. of_each: that of each by itself, [B, 2, M].
     """
 
     middle: Tensor
     shoulders: Tensor
     arms: Arms
     evidence: Tensor
+    of_each: Tensor
 
 
 class RootStep(NamedTuple):
@@ -107,11 +109,12 @@ class RootStep(NamedTuple):
             believed = believed * of_face[:, None].exp()
         if fresh is not None:
             far = self.grid.at_all_depths(believed)
-            against = self.grid.ruled_out(self._weighed(frame, far, last, sizes).evidence)
+            said, limbs = self._weighed(frame, far, last, sizes), frame.given.limbs
+            against = self.grid.ruled_out(said.of_each, limbs.any(2))
             against = torch.where(fresh[:, None, None], against, 0.0)
             believed = believed * against.exp()[:, None]
         root = self.grid.best(believed, _ROOTS)
-        middle, shoulders, arms, evidence = self._weighed(frame, root, last, sizes)
+        middle, shoulders, arms, evidence, _ = self._weighed(frame, root, last, sizes)
         evidence = power[:, None] * evidence
         if fresh is not None:  # in place of what was said against them
             evidence = evidence - against.flatten(1).gather(1, root.cell)
@@ -126,9 +129,9 @@ class RootStep(NamedTuple):
         middle = self.middle(frame.torso, root, last, sizes)
         shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
         arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
-        seen = frame.given.limbs.sum((1, 2)).to(root.depth)
-        evidence = self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
-        return _Weighed(middle, shoulders, arms, evidence)
+        area = 2 * frame.given.limbs.sum(2)[..., None] * root.depth.log()[:, None]
+        both = self.chain.evidence_of_both(arms) + area.sum(1)
+        return _Weighed(middle, shoulders, arms, both, arms.log_evidence + area)
 
     def middle(
         self, torso: Torso, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes

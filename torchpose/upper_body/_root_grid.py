@@ -147,17 +147,22 @@ class RootGrid:
         index = depths[:, None] * n_turns + half * self._sides[:, 0] + halves.argmax(-1)
         return self._at(weight, index.flatten(1))
 
-    def ruled_out(self, evidence: Float[Tensor, "B N"]) -> Float[Tensor, "B Z P"]:
+    def ruled_out(
+        self, evidence: Float[Tensor, "B 2 N"], seen: Bool[Tensor, "B 2"]
+    ) -> Float[Tensor, "B Z P"]:
         """Return the evidence against every cell, nats: 0 where arms may be that far away.
 
         One frame does not tell depths apart whose evidence is within some nats of the best, and tells the
-        others apart as a later frame would.
+        others apart as a later frame would. Of two arms the milder one counts for both, since a keypoint
+        of the other may be an outlier.
 
         Args:
-            evidence: the log-evidence of the arms at the hypotheses of `at_all_depths`.
+            evidence: the log-evidence of each arm at the hypotheses of `at_all_depths`.
+            seen: whether elbow or hand of each arm are measured.
         """
-        worse = evidence - evidence.amax(1, keepdim=True)
-        against = (self._between @ worse.unflatten(1, (-1, 2)) + _TOLERATED).clamp_max(0.0)
+        worse = evidence - evidence.amax(2, keepdim=True)
+        agreed = torch.where(seen.all(1, keepdim=True), 2 * worse.amax(1), worse.sum(1))
+        against = (self._between @ agreed.unflatten(1, (-1, 2)) + _TOLERATED).clamp_max(0.0)
         return _RULING * against.repeat_interleave(len(self.turn) // 2, -1)
 
     def _at(self, weight: Float[Tensor, "B S Z P"], index: Int[Tensor, "B M"]) -> Root:
