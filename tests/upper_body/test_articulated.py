@@ -93,6 +93,32 @@ def test_turned_bodies_are_seen_as_turned(turn):
     assert float(cosine) > math.cos(math.radians(25))
 
 
+@pytest.mark.parametrize("hidden", [0, 4], ids=["at-once", "arms-later"])
+@pytest.mark.parametrize("turn", [-1.2, 1.2, 1.6])
+def test_a_body_seen_from_the_side_is_not_far_away(turn, hidden):
+    """Shoulders that are one behind the other look like those of somebody far away; arms do not."""
+    joints = body(8, turn=turn, depth=2.7)
+    seen = pixels(joints, 2.0)[None]
+    shoulders = [ROW["shoulder_left"], ROW["shoulder_right"]]
+    seen[:, :, ROW["head"]] = torch.nan
+    seen[:, :, ROW["neck"]] = seen[:, :, shoulders].mean(2)
+    seen[:, :hidden, [ROW[name] for name in UPPER_BODY if "elbow" in name or "hand" in name]] = (
+        torch.nan
+    )
+    found = tracker(neck="mid-shoulder", outliers=False)(seen).joints3d[0]
+    depth, true = (x[:, shoulders, 2].mean(1) for x in (found, joints))
+    after = hidden + 2 if hidden else 0  # the torso is updated in every third frame
+    assert float((depth[after:] / true[after:]).log().abs().max()) < 0.25
+
+
+def test_a_first_hand_that_is_an_outlier_does_not_bring_a_body_near():
+    joints = body(8, depth=2.7)
+    seen = pixels(joints, 2.0)[None]
+    seen[0, 0, ROW["hand_left"]] = seen[0, 0, ROW["neck"]] - torch.tensor([90.0, 70.0])
+    found = tracker(outliers=False)(seen).joints3d[0]
+    assert float(found[-1, ROW["neck"], 2]) > 0.75 * 2.7
+
+
 def test_scale_and_depth_are_one():
     """A body twice as large at twice the distance has the same pixels, so the scale stays the prior's."""
     torch.testing.assert_close(pixels(2 * body(12)), pixels(body(12)))

@@ -65,3 +65,24 @@ def test_what_else_tells_the_depth_adds_up_against_the_usual_size(grid):
     found = grid.moments(belief)
     assert float(found.depth) == pytest.approx(true, rel=0.04)
     assert float(found.size) == pytest.approx(true / 2.0, rel=0.06)
+
+
+def test_depths_at_which_arms_cannot_be_are_ruled_out(grid):
+    """Arms that fit best at 2 m say nothing about 2.2 m, and much against 5 m."""
+    belief = grid.init(1, torch.tensor(0.12, dtype=torch.float64))
+    root = grid.at_all_depths(belief)
+    assert root.depth[0, ::2].tolist() == root.depth[0, 1::2].tolist() == grid.depth[::4].tolist()
+    assert bool((root.turn[:, ::2] < 0).all() and (root.turn[:, 1::2] >= 0).all())
+    said = -0.5 * ((root.depth / 2.0).log() / 0.07).square()
+    both = torch.tensor([[True, True]])
+    against = grid.ruled_out(said[:, None].expand(-1, 2, -1), both)
+    assert against.shape == belief[:, 0].shape
+    near = (grid.depth / 2.0).log().abs() < 0.15
+    assert float(against[:, near].abs().max()) == 0.0
+    assert float(against[:, grid.depth > 5.0].max()) < -20.0
+    # an arm whose hand is an outlier says nothing alone; one that is the only one does
+    misled = -0.5 * ((root.depth / 0.8).log() / 0.07).square()
+    apart = torch.stack([0 * said, misled], 1)
+    assert float(grid.ruled_out(apart, both).abs().max()) == 0.0
+    alone = grid.ruled_out(apart, torch.tensor([[False, True]]))
+    assert float(alone[:, grid.depth > 2.0].max()) < -5.0

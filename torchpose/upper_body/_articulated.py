@@ -67,6 +67,8 @@ class ArticulatedState(NamedTuple):
             torso was seen.
         lean: the moments of the line between the shoulders (`seen_lean`), [B, 2].
         frame: the number of frames before.
+        waiting: of whom no elbow or hand has been seen yet beside two joints of the torso, [B]; None if
+            of nobody. One joint has no size in the image, and so no depth that arms could rule out.
     """
 
     root: Tensor
@@ -76,6 +78,7 @@ class ArticulatedState(NamedTuple):
     middle: Tensor
     lean: Tensor
     frame: int
+    waiting: Tensor | None
 
 
 class _Seen(NamedTuple):
@@ -200,7 +203,8 @@ class ArticulatedFilter(Estimator):
         lengths = self.lengths.init(batch_size, self.grid.moments(root).of_size)
         middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
         lean = root.new_zeros(batch_size, 2)
-        return ArticulatedState(root, None, lengths, None, middle, lean, 0)
+        waiting = torch.ones(batch_size, dtype=torch.bool, device=root.device)
+        return ArticulatedState(root, None, lengths, None, middle, lean, 0, waiting)
 
     def advance(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
@@ -276,10 +280,15 @@ class ArticulatedFilter(Estimator):
         last = (state.middle[:, None] @ tilt)[:, 0]
         tilted = upright(frame, facts, tilt)
         # the torso: one hypothesis of the root, the mean of those near the likeliest
-        belief, roots = state.root, state.roots
+        belief, roots, waiting = state.root, state.roots, state.waiting
         if roots is None or state.frame % self.every == 0:
-            power = 1.0 if roots is None else self.power
-            belief, roots = self.root.weigh(belief, tilted, last, sizes, power)
+            power = torch.full_like(last[:, 0], 1.0 if roots is None else self.power)
+            fresh = None
+            if waiting is not None:
+                there = frame.limbs.flatten(1).any(1) & (frame.torso.sum(1) > 1)
+                fresh, waiting = waiting & there, _some(waiting & ~there)
+                power = power.masked_fill(fresh, 1.0)
+            belief, roots = self.root.weigh(belief, tilted, last, sizes, power, fresh)
         root = roots.mean
         middle = self.root.middle(tilted.torso, root, last, sizes)
         shoulders = shoulder_places(tilted, root, middle, sizes.torso.width)
@@ -301,7 +310,9 @@ class ArticulatedFilter(Estimator):
             roots, root, middle, shoulders,
         )  # fmt: skip
         middle = (middle @ tilt.mT)[:, 0]
-        after = ArticulatedState(belief, roots, learnt, posterior, middle, moments, state.frame + 1)
+        after = ArticulatedState(
+            belief, roots, learnt, posterior, middle, moments, state.frame + 1, waiting
+        )
         return _Step(after, seen, posterior)
 
     def _poses(self, found: Sequence[tuple[_Seen, ArmState]]) -> FramePose:
@@ -333,6 +344,11 @@ class ArticulatedFilter(Estimator):
 
     def _estimates(self, poses: Sequence[FramePose], batch_size: int) -> Estimates:
         return estimates_of(poses, batch_size, self.matrix, self.lengths.names)
+
+
+def _some(chosen: Tensor) -> Tensor | None:
+    """Return the same; None if nobody is chosen."""
+    return chosen if bool(chosen.any()) else None
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

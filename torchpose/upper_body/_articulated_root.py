@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.math._rotations import within_half_turn
@@ -53,6 +53,22 @@ class Roots(NamedTuple):
         return Root(depth, turn, size, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
 
+class _Weighed(NamedTuple):
+    """Arms given each of M hypotheses of the root.
+
+    Attributes:
+        middle, shoulders: the middle of the shoulders, [B, M, 3], and their places, [B, 2, M, 3].
+        arms: the hypotheses about both arms.
+        evidence: the log-evidence of both together, [B, M]. of_each: that of each by itself, [B, 2, M].
+    """
+
+    middle: Tensor
+    shoulders: Tensor
+    arms: Arms
+    evidence: Tensor
+    of_each: Tensor
+
+
 class RootStep(NamedTuple):
     """Measurement update of the torso, with the arms given it.
 
@@ -71,7 +87,8 @@ class RootStep(NamedTuple):
         frame: UprightFrame,
         last: Tensor,
         sizes: Sizes,
-        power: float,
+        power: Float[Tensor, " B"],
+        fresh: Bool[Tensor, " B"] | None,
     ) -> tuple[Float[Tensor, "B S Z P"], Roots]:
         """Return the posterior over the grid and the likeliest hypotheses.
 
@@ -79,6 +96,8 @@ class RootStep(NamedTuple):
             belief: the belief at the last update. frame: the measurements, in tilted axes.
             last: the middle of the shoulders in the frame before, in the same axes, [B, 3].
             sizes: the lengths of the bones. power: the exponent of the likelihood.
+            fresh: whose arms are seen for the first time with a torso, so that the depths at which they
+                cannot be are ruled out before the likeliest hypotheses are picked; None is nobody.
         """
         likelihood = self.grid.likelihood(frame.torso, sizes.torso, power)
         believed = self.grid.predict(belief) * likelihood
@@ -86,17 +105,31 @@ class RootStep(NamedTuple):
             std = frame.given.std.amin(1)
             of_face = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
             believed = believed * of_face[:, None].exp()
+        if fresh is not None:
+            far = self.grid.at_all_depths(believed)
+            said, limbs = self._weighed(frame, far, last, sizes), frame.given.limbs
+            against = self.grid.ruled_out(said.of_each, limbs.any(2))
+            against = torch.where(fresh[:, None, None], against, 0.0)
+            believed = believed * against.exp()[:, None]
         root = self.grid.best(believed, _ROOTS)
-        middle = self.middle(frame.torso, root, last, sizes)
-        shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
-        arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
-        seen = frame.given.limbs.sum((1, 2)).to(root.depth)
-        evidence = power * (
-            self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
-        )
+        middle, shoulders, arms, evidence, _ = self._weighed(frame, root, last, sizes)
+        evidence = power[:, None] * evidence
+        if fresh is not None:  # in place of what was said against them
+            evidence = evidence - against.flatten(1).gather(1, root.cell)
         belief = self.grid.belief(believed, root, evidence, frame.given.extrapolates)
         root = root._replace(log_weight=root.log_weight + evidence)
         return belief, Roots(root, _shares_of_mode(root), middle, shoulders, arms.mean_directions)
+
+    def _weighed(
+        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
+    ) -> _Weighed:
+        """Return the arms given each hypothesis of the root, and their log-evidence."""
+        middle = self.middle(frame.torso, root, last, sizes)
+        shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
+        arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
+        area = 2 * frame.given.limbs.sum(2)[..., None] * root.depth.log()[:, None]
+        both = self.chain.evidence_of_both(arms) + area.sum(1)
+        return _Weighed(middle, shoulders, arms, both, arms.log_evidence + area)
 
     def middle(
         self, torso: Torso, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.upper_body._torso_likelihood import Root, Torso, TorsoLengths, torso_log_likelihood
@@ -18,6 +18,11 @@ _SIZES, _CELLS = 11, 2  # of torsos, and steps of log depth from one to the next
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
+_EVERY = 4  # steps of log depth between the depths of `RootGrid.at_all_depths`
+_TOLERATED, _RULING = (
+    8.0,
+    0.2,
+)  # nats by which arms fit worse than best, and the weight of what is beyond
 _MOST_SAID = 0.1  # nats of extrapolated evidence
 _MOST = 500.0  # nats by which a cell may gain, which has next to no belief then
 _LOST = 1e-6  # share of a frame's belief that restarts from the prior
@@ -66,6 +71,9 @@ class RootGrid:
             -0.5 * ((self.depth.log() - math.log(_DEPTH)) / _DEPTH_STD).square(), 0
         )
         self.prior = ((1 - _BROAD_TURN) * usual + _BROAD_TURN / n_turns) * near[:, None]
+        rows = torch.arange(n_depths).to(like) / _EVERY
+        near = (1 - (rows[:, None] - rows[::_EVERY]).abs()).clamp_min(0.0)
+        self._between = near / near.sum(1, keepdim=True)
         self._sides = torch.arange(2, device=like.device)[:, None]
         self._spread = (
             _share_that_moves(_SPEED / math.sqrt(fps), _DEPTH_STEP),
@@ -96,18 +104,19 @@ class RootGrid:
         return torch.addcmul(moved, anew, self.prior, value=_LOST)
 
     def likelihood(
-        self, torso: Torso, lengths: TorsoLengths, power: float = 1.0
+        self, torso: Torso, lengths: TorsoLengths, power: Float[Tensor, " B"] | None = None
     ) -> Float[Tensor, "B S Z #P"]:
         """Return the likelihood of the torso's joints at every size, depth and turn, of largest value 1.
 
         Args:
-            torso: the measured joints. lengths: the lengths of the torso. power: its exponent.
+            torso: the measured joints. lengths: the lengths of the torso. power: its exponent; None is 1.
         """
         turn = self.turn if torso.sided else self.turn[:1]
         shape = (len(torso.rays), len(self._relative), len(turn))
         relative = self._relative[:, None].expand(shape)
         logs = torso_log_likelihood(torso, relative, turn.expand(shape), lengths)
-        found = (power * (logs - logs.amax((1, 2), keepdim=True))).exp()
+        logs = logs - logs.amax((1, 2), keepdim=True)
+        found = (logs if power is None else power[:, None, None] * logs).exp()
         return found.unfold(1, len(self.depth), _CELLS).flip(1).mT
 
     def best(self, weight: Float[Tensor, "B S Z P"], count: int) -> Root:
@@ -119,10 +128,48 @@ class RootGrid:
             weight: the belief, of any sum. count: the number of both halves.
         """
         n_turns, half = len(self.turn), len(self.turn) // 2
-        whole = weight.sum(1)
-        halves = whole.unflatten(-1, (2, half)).movedim(2, 1).flatten(2)
+        halves = weight.sum(1).unflatten(-1, (2, half)).movedim(2, 1).flatten(2)
         index = halves.topk(count // 2, -1).indices
-        index = (index // half * n_turns + index % half + half * self._sides).flatten(1)
+        index = index // half * n_turns + index % half + half * self._sides
+        return self._at(weight, index.flatten(1))
+
+    def at_all_depths(self, weight: Float[Tensor, "B S Z P"]) -> Root:
+        """Return the likeliest turn to either side at every fourth depth.
+
+        Args:
+            weight: the belief, of any sum.
+        """
+        n_turns, half = len(self.turn), len(self.turn) // 2
+        halves = weight[:, :, ::_EVERY].sum(1).unflatten(-1, (2, half))
+        depths = _EVERY * torch.arange(halves.shape[1], device=weight.device)
+        index = depths[:, None] * n_turns + half * self._sides[:, 0] + halves.argmax(-1)
+        return self._at(weight, index.flatten(1))
+
+    def ruled_out(
+        self, evidence: Float[Tensor, "B 2 N"], seen: Bool[Tensor, "B 2"]
+    ) -> Float[Tensor, "B Z P"]:
+        """Return the evidence against every cell, nats: 0 where arms may be that far away.
+
+        One frame does not tell depths apart whose evidence is within some nats of the best, and tells the
+        others apart as a later frame would. Of two arms the milder one counts for both, since a keypoint
+        of the other may be an outlier.
+
+        Args:
+            evidence: the log-evidence of each arm at the hypotheses of `at_all_depths`.
+            seen: whether elbow or hand of each arm are measured.
+        """
+        worse = evidence - evidence.amax(2, keepdim=True)
+        agreed = torch.where(seen.all(1, keepdim=True), 2 * worse.amax(1), worse.sum(1))
+        against = (self._between @ agreed.unflatten(1, (-1, 2)) + _TOLERATED).clamp_max(0.0)
+        return _RULING * against.repeat_interleave(len(self.turn) // 2, -1)
+
+    def _at(self, weight: Float[Tensor, "B S Z P"], index: Int[Tensor, "B M"]) -> Root:
+        """Return the hypotheses of some cells of depth and turn.
+
+        Args:
+            weight: the belief, of any sum. index: the cells in the flat grid.
+        """
+        n_turns = len(self.turn)
         of_sizes = index[:, None].expand(-1, len(self.log_size), -1)
         share = weight.flatten(2).gather(2, of_sizes)
         total = share.sum(1)
