@@ -11,6 +11,7 @@ from functools import lru_cache
 from torchpose.errors import SkeletonError
 
 __all__ = [
+    "COCO",
     "SKELETONS",
     "UPPER_BODY",
     "Skeleton",
@@ -30,6 +31,13 @@ UPPER_BODY = (
     "hand_right",
 )
 """The eight joints in the order that every result of the library has."""
+
+COCO = (
+    "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
+    "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
+    "left_knee", "right_knee", "left_ankle", "right_ankle",
+)  # fmt: skip
+"""The 17 keypoints of COCO, with which Halpe's 26 and the 133 of COCO-WholeBody begin."""
 
 # --- names ----------------------------------------------------------------------------------------
 
