@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from tests.data import data_dir_or_skip
 from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
 from torchpose.io import Keypoints, read_keypoints, write_keypoints
-from torchpose.io._formats.openpose import _BODY_25B
+from torchpose.io._formats.openpose import _BODY_25B, read_openpose_people
 from torchpose.skeleton import SKELETONS
+from torchpose.skeleton._joint_sets import COCO
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 NAMES = ("head", "lhand", "RWrist")
 
@@ -301,6 +303,21 @@ def test_openpose_folder(tmp_path, joints):
     assert read.neck == "mid-shoulder"
 
 
+@pytest.mark.parametrize(
+    ("joints", "names"), [(17, COCO), (26, COCO), (133, COCO), (33, LANDMARKS)]
+)
+def test_folders_of_other_joint_sets(tmp_path, joints, names):
+    flat = np.stack([10 + np.arange(joints), np.full(joints, 5), np.full(joints, 0.9)], -1)
+    frame(
+        tmp_path / "json", 4, {"pose_keypoints_2d": flat.ravel().tolist()}, person(1, 0.2, joints)
+    )
+    read = read_keypoints(tmp_path / "json")
+    assert read.names[: len(names)] == names
+    assert read.keypoints[0, : len(names), 0].tolist() == [10 + i for i in range(len(names))]
+    everybody = read_openpose_people(tmp_path / "json")
+    assert everybody.names == names and everybody.keypoints.shape == (1, 2, len(names), 2)
+
+
 _STANDING = {  # pixels
     "Nose": (0, -60), "LEye": (3, -63), "REye": (-3, -63), "LEar": (8, -60), "REar": (-8, -60),
     "Neck": (0, 0), "MidHip": (0, 100), "Head": (0, -80), "LShoulder": (35, 0), "RShoulder": (-35, 0),
@@ -360,7 +377,7 @@ def test_bad_openpose_folders(tmp_path):
     with pytest.raises(InputError, match="nobody was found in any of 1"):
         read_keypoints(tmp_path / "nobody")
     frame(tmp_path / "mixed", 0, person(1), person(1, joints=18))
-    frame(tmp_path / "other", 0, person(1, joints=17))
+    frame(tmp_path / "other", 0, person(1, joints=16))
     for name in ("mixed", "other"):
         with pytest.raises(FileFormatError, match="BODY_25"):
             read_keypoints(tmp_path / name)

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.measure._detectors.joint_sets import COCO
 from torchpose.measure._detectors.protocol import Detections
 from torchpose.measure._keypoint_measurer import KeypointMeasurer
+from torchpose.skeleton._joint_sets import COCO
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 SIZE = (640, 480)

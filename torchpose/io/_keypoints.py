@@ -101,8 +101,9 @@ def read_keypoints(path: str | Path) -> Keypoints:
     long form ``frame,name,x,y[,confidence]`` with a row per keypoint. Empty cells and absent frames
     are missing. Lines ``# fps = 30`` and ``# image_size = 640,480`` may stand above the header.
 
-    A folder: OpenPose's ``*_keypoints.json``, one per frame, BODY_25 or COCO 18. Of several people,
-    the most confident one is followed; see `torchpose.io._formats.openpose`.
+    A folder: OpenPose's ``*_keypoints.json``, one per frame, of BODY_25, BODY_25B, COCO, Halpe, MediaPipe or
+    COCO-WholeBody. Of several people, the most confident one is followed; see
+    `torchpose.io._formats.openpose`.
 
     Args:
         path: file or folder.

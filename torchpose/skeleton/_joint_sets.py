@@ -22,6 +22,13 @@ UPPER_BODY = (
 )
 """The eight joints in the order that every result of the library has."""
 
+COCO = (
+    "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
+    "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
+    "left_knee", "right_knee", "left_ankle", "right_ankle",
+)  # fmt: skip
+"""The 17 keypoints of COCO, with which Halpe's 26 and the 133 of COCO-WholeBody begin."""
+
 # --- names ----------------------------------------------------------------------------------------
 
 # canonical part: other words for it. Words are compared without case, blanks and punctuation.

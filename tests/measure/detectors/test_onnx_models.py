@@ -8,11 +8,11 @@ import torch
 
 from torchpose.errors import FileFormatError, InputError, MissingDependencyError
 from torchpose.measure._detectors import networks
-from torchpose.measure._detectors.joint_sets import COCO
 from torchpose.measure._detectors.load import load_detector
 from torchpose.measure._detectors.networks import image_input, open_network
 from torchpose.measure._detectors.onnx_header import read_inputs
 from torchpose.measure._detectors.onnx_model import CroppingOnnxModel, load_onnx
+from torchpose.skeleton._joint_sets import COCO
 
 pytest.importorskip("onnx", reason="onnx makes the models of these tests; see the extra dev")
 from tests.measure.detectors import tiny_networks as tiny

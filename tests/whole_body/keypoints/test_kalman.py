@@ -20,7 +20,11 @@ from torchpose.errors import (
 )
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body import BodyTrack, BodyTracker
-from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
+from torchpose.whole_body._keypoints.keypoint_notes import (
+    TOO_FEW,
+    late_note,
+    notes_on_still_cameras,
+)
 
 J = BODY_15.joint
 
@@ -294,6 +298,18 @@ def test_a_camera_that_sees_something_else_is_named(four):
 
 
 # --- forms ------------------------------------------------------------------------------------------
+
+
+def test_a_camera_whose_video_stands_still_is_named():
+    pixels = scene(3, n_frames=40).keypoints
+    pixels[5:, 2] = pixels[5, 2]
+    there = torch.ones(pixels.shape[:3], dtype=torch.bool)
+    (note,) = notes_on_still_cameras(("a", "b", "c"), pixels, there, 10)
+    assert note.startswith("the keypoints of camera c are exactly the same in frames 15 to 49;")
+    found = BodyTracker(ring(3), "kalman", fps=FPS)(keypoints=pixels)
+    assert any("camera c2 are exactly the same in frames 5 to 39" in n for n in found.notes)
+    everything = pixels[:1].expand_as(pixels)  # a person who does not move at all
+    assert notes_on_still_cameras(("a", "b", "c"), everything, there) == ()
 
 
 def test_frame_by_frame_gives_the_same(four, filtered):

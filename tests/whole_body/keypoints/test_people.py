@@ -53,6 +53,17 @@ def test_persons_who_pass_each_other_stay_who_they_are(cameras):
         assert float((whose == p)[used >= 0].double().mean()) == 1.0
 
 
+@pytest.mark.parametrize("cameras", [3, 2])
+def test_persons_are_found_at_five_frames_a_second(cameras):
+    rig, joints, pixels = passing(cameras)
+    slow = BodyTracker(rig, method="kalman", fps=FPS / 6)
+    found = slow(keypoints=shuffled(pixels[::6])[0], persons="all")
+    assert [(one.first_frame, len(one)) for one in found] == [(0, 7), (0, 7)]
+    for one in found:
+        off = (one.joints3d - joints[::6].movedim(1, 0)).norm(dim=-1).mean((1, 2))
+        assert float(off.min()) < 0.05
+
+
 def test_a_camera_that_is_turned_is_used_all_the_same():
     rig, _, pixels = passing(3)
     angle = math.radians(1.3)

@@ -1,5 +1,8 @@
 """Read OpenPose output: a folder with one `*_keypoints.json` per frame.
 
+Other programs write the same files with the joint sets of their detectors, as Pose2Sim does. How many
+keypoints a person has tells the set.
+
 Of several people one is followed: in the first frame with people the one of largest mean confidence,
 afterwards the one nearest to the last frame in which that person was seen (mean pixel distance over
 the keypoints that both have); where nothing can be compared, again the one of largest mean
@@ -15,10 +18,18 @@ import numpy as np
 
 from torchpose._core.reading import check_span, read_json, reading
 from torchpose.errors import FileFormatError, InputError
-from torchpose.skeleton._joint_sets import SKELETONS
+from torchpose.skeleton._joint_sets import COCO, SKELETONS
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _SUFFIX = "_keypoints.json"
-_LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
+_LAYOUTS = {  # the first keypoints of everybody, by how many there are
+    25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints, 17: COCO, 26: COCO,
+    33: LANDMARKS, 133: COCO,
+}  # fmt: skip
+_KNOWN = (
+    "25 keypoints (BODY_25 or BODY_25B), 18 or 17 (COCO with and without a neck), 26 (Halpe), 33 (MediaPipe) "
+    "or 133 (COCO-WholeBody)"
+)
 _BODY_25B = (
     "Nose", "LEye", "REye", "LEar", "REar", "LShoulder", "RShoulder", "LElbow", "RElbow", "LWrist", "RWrist",
     "LHip", "RHip", "LKnee", "RKnee", "LAnkle", "RAnkle", "Neck", "Head", "LBigToe", "LSmallToe", "LHeel",
@@ -35,7 +46,7 @@ class OpenPosePerson(NamedTuple):
 
     Attributes:
         keypoints: [T, J, 2], pixels, NaN where missing. confidence: [T, J].
-        names: of BODY_25, BODY_25B or COCO 18, whichever the files hold.
+        names: of what is taken of the joint set that the files hold.
         n_people: how many people are in each frame [T]. first: number of the first file.
     """
 
@@ -70,7 +81,7 @@ def read_openpose(folder: str | Path) -> OpenPosePerson:
 
     Returns:
         `OpenPosePerson`. BODY_25B has as many keypoints as BODY_25 in another order; where the necks and
-        hips are tells which it is.
+        hips are tells which it is. Of Halpe's 26 and the 133 of COCO-WholeBody the 17 of COCO are taken.
 
     Raises:
         InputError: no such files, or nobody in any of them. FileFormatError: not OpenPose's JSON,
@@ -114,7 +125,8 @@ def _read_frames(folder: str | Path) -> tuple[list[list[np.ndarray]], tuple[str,
     everybody = [person for group in people.values() for person in group]
     names = _layout(folder, everybody, len(files))
     first = min(files)
-    return [people.get(frame, []) for frame in range(first, max(files) + 1)], names, first
+    taken = {frame: [one[: len(names)] for one in group] for frame, group in people.items()}
+    return [taken.get(frame, []) for frame in range(first, max(files) + 1)], names, first
 
 
 def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) -> tuple[str, ...]:
@@ -124,8 +136,7 @@ def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) 
         raise InputError(f"{folder}: nobody was found in any of {n_frames} frames")
     if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
         raise FileFormatError(
-            f"{folder}: expected 25 keypoints (BODY_25 or BODY_25B) or 18 (COCO) for everybody, got "
-            f"{', '.join(map(str, sorted(sizes)))}"
+            f"{folder}: expected {_KNOWN} for everybody, got {', '.join(map(str, sorted(sizes)))}"
         )
     stacked = np.stack(everybody)
     return _BODY_25B if _is_body_25b(stacked) else _LAYOUTS[stacked.shape[1]]

@@ -6,14 +6,8 @@ import torch
 
 from torchpose.errors import InputError
 from torchpose.measure._detectors.protocol import Detections
+from torchpose.skeleton._joint_sets import COCO
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
-
-COCO = (
-    "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
-    "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
-    "left_knee", "right_knee", "left_ankle", "right_ankle",
-)  # fmt: skip
-"""The 17 keypoints of COCO, with which Halpe's 26 and the 133 of COCO-WholeBody begin."""
 
 _HAND = 0.7  # of the way from the wrist to the knuckle of the middle finger, as with MediaPipe's index finger
 _WRISTS, _KNUCKLES = [9, 10], [100, 121]  # of COCO-WholeBody, left and right

@@ -14,6 +14,7 @@ with H the derivative of the joints and W, b the information of all keypoints ab
 Cholesky factors of I + L^T G L.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self
 
@@ -53,6 +54,8 @@ _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
 _SCALE_TIME = 2.0  # seconds over which they are estimated
+_MOST = 0.7  # share of a camera's keypoints below which its noise may be wider
+_WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of it that are tried
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
 
 
@@ -332,9 +335,37 @@ class BodyKalmanFilter(nn.Module):
     ) -> Float[Tensor, "B C"]:
         """Return the factors of the cameras' noise, averaged over the last seconds."""
         sums, count = squared_errors(readings, seen, weighed, joint_cov)
+        few = (weighed.own + weighed.other).sum(-1) < _MOST * readings.inlier[0].sum(-1)
+        few = few.any(-1, keepdim=True)  # which cameras are wrong is not known
+        if len(self.maps.shift) > 1 and bool(few.any()):
+            beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), scale)
+            wide_sums, wide_count = self._by_wider(readings, seen, beliefs, joint_cov)
+            sums, count = torch.where(few, wide_sums, sums), torch.where(few, wide_count, count)
         share = (count / _SCALE_COUNT).clamp_max(1) / (_SCALE_TIME * self.fps)
         ratio = sums / count.clamp_min(1e-6)
         return (scale * (1 + share * (ratio - 1))).clamp(*NOISE_SCALES)
+
+    def _by_wider(
+        self, readings: KeypointFrame, seen: Seen, beliefs: Beliefs, joint_cov: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return sums of squared errors and counts by the noise, as it is or wider, that explains a camera.
+
+        Keypoints of a camera that sees bodies elsewhere, by a wrong calibration, are all outliers by a noise
+        that is too narrow, and would tell nothing about it.
+        """
+        sums, count = torch.zeros_like(beliefs.scale), torch.zeros_like(beliefs.scale)
+        best = torch.full_like(sums, -math.inf)
+        for width in _WIDTHS:
+            weighed = weigh(
+                readings, seen, self.maps, beliefs, self.exchange, decide=False, width=width
+            )
+            explained = weighed.log_joint.sum(-1)
+            own_sums, own_count = squared_errors(readings, seen, weighed, joint_cov)
+            better = explained > best
+            sums = torch.where(better, width * own_sums, sums)
+            count = torch.where(better, own_count, count)
+            best = torch.maximum(best, explained)
+        return sums, count
 
     # --- joints elsewhere than predicted ------------------------------------------------------------
 

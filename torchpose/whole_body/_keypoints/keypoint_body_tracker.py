@@ -36,7 +36,12 @@ from torchpose.whole_body._keypoints.camera_refinement import (
 )
 from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note, notes_of
+from torchpose.whole_body._keypoints.keypoint_notes import (
+    TOO_FEW,
+    late_note,
+    notes_of,
+    notes_on_still_cameras,
+)
 from torchpose.whole_body._keypoints.keypoint_tracker import (
     LEAST_JOINTS,
     KeypointPoses,
@@ -352,6 +357,8 @@ class KeypointBodyTracker(nn.Module):
             self.rig.names, frame.inlier > 0, poses.inlier, poses.exchanged, poses.coasting,
             poses.alone, self.sized, first_frame,
         )  # fmt: skip
+        there = frame.inlier > 0
+        notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
         if len(self.rig) == 1 or not cameras:
             return notes
         rig = self.rig if refined is None else refined.rig

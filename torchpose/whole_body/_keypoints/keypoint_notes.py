@@ -82,6 +82,30 @@ def notes_of(
     return tuple(notes)
 
 
+def notes_on_still_cameras(
+    cameras: Sequence[str],
+    pixels: Float[Tensor, "T C J 2"],
+    there: Bool[Tensor, "T C J"],
+    first_frame: int = 0,
+) -> tuple[str, ...]:
+    """Return notes on cameras whose keypoints stay exactly the same while those of others do not.
+
+    Args:
+        cameras: their names. pixels: of keypoints. there: which there were.
+        first_frame: number of the first of the frames.
+    """
+    both = there[1:] & there[:-1]
+    moved = ((pixels[1:] != pixels[:-1]).any(-1) & both).any(-1)
+    still = both.any(-1) & ~moved & moved.any(-1, keepdim=True)
+    return tuple(
+        f"the keypoints of camera {name} are exactly the same in frames {first_frame + first} to "
+        f"{first_frame + last + 1}; check whether its video stands still"
+        for name, flags in zip(cameras, still.unbind(1), strict=True)
+        for first, last in _runs(flags)
+        if last - first + 2 >= _GAP
+    )
+
+
 def _runs(flags: Bool[Tensor, " T"]) -> list[tuple[int, int]]:
     """Return first and last index of each run of True."""
     runs, begin = [], None

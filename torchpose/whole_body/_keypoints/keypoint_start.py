@@ -40,6 +40,8 @@ _WIDTHS = (
     1.0,
     1.0,
 )  # factors of the noise's variance
+_WIDER = 16.0  # factor of the variance of cameras whose calibration may be wrong
+_FEW = 0.7  # share of the keypoints of a start below which they are
 _WIDTHS_OF_ONE = _WIDTHS[-5:]
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
@@ -59,8 +61,28 @@ def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
     state = _begun(filter, joints, joints.isfinite().all(-1), _HEADINGS)
     every = torch.arange(len(joints), device=joints.device)
     found = filter.correct(state, frame.take(every.repeat_interleave(_HEADINGS)), _WIDTHS)
-    best = found.log_evidence.view(-1, _HEADINGS).argmax(-1)
-    return found.take(every * _HEADINGS + best)
+    best = every * _HEADINGS + found.log_evidence.view(-1, _HEADINGS).argmax(-1)
+    return _by_wider(filter, frame, state.take(best), found.take(best))
+
+
+def _by_wider(
+    filter: BodyKalmanFilter, frame: KeypointFrame, state: BodyGaussian, found: CorrectedBody
+) -> CorrectedBody:
+    """Return starts, with a wider noise of all cameras where that is likelier.
+
+    Where calibrations are wrong, no three cameras agree on a joint by the usual noise. Two that do not
+    agree may as well see two persons.
+    """
+    share = (found.weighed.own + found.weighed.other).sum((-2, -1)) / frame.inlier.sum((-2, -1))
+    several = (frame.inlier > 0).any(-1).sum(-1) > 2
+    rows = ((share < _FEW) & several).nonzero().squeeze(-1)
+    if not len(rows):
+        return found
+    state = state.take(rows)
+    wide = state._replace(scale=_WIDER * state.scale)
+    again = filter.correct(wide, frame.take(rows), _WIDTHS)
+    better = again.log_evidence > found.log_evidence[rows]
+    return found.put(rows[better], again.take(better.nonzero().squeeze(-1)))
 
 
 def start_of_one(

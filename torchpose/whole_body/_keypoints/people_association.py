@@ -33,6 +33,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 
 LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
 _BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
+_FARTHER = 2.0  # standard deviations of a prediction, within which somebody else is
 _AGREE = 0.5  # share of the joints of two detections that must be triangulated
 _WIDER = 2.0  # factor of the noise's variance, of a point that two cameras give
 _BONE_STD = 0.25  # of a bone's length, relative
@@ -62,16 +63,27 @@ def detection_gains(
         joint_cov[persons], marginal=True, width=width,
     )  # fmt: skip
     there = pairs.inlier > 0
-    of_another = torch.where(seen.in_front, _of_another(seen), -filter.maps.log_area[:, None])
+    about = _of_another(seen, joint_cov[persons])
+    of_another = torch.where(seen.in_front, about, -filter.maps.log_area[:, None])
     gain = (weighed.log_joint - torch.where(there, of_another, 0.0)).sum(-1)
     gain = torch.where(there.any(-1), gain, -math.inf)
     return gain.unflatten(0, (n_persons, n_detections)).mT
 
 
-def _of_another(seen: Seen) -> Float[Tensor, "B C J"]:
-    """Return the log density of a keypoint of somebody else who is about here."""
-    size = 0.5 * seen.by_joint.square().sum((-2, -1))
-    return -(2 * math.pi * _BODY_SIZE**2 * size).log()
+def _of_another(
+    seen: Seen, joint_cov: Float[Tensor, "B J 3 3"] | None = None
+) -> Float[Tensor, "B C J"]:
+    """Return the log density of a keypoint of somebody else who is about here.
+
+    Args:
+        seen: joints. joint_cov: of their prediction. Where that hardly tells the place, as at few frames a
+            second, somebody else is no nearer than the person may be.
+    """
+    variance = 0.5 * _BODY_SIZE**2 * seen.by_joint.square().sum((-2, -1))
+    if joint_cov is not None:
+        spread = seen.by_joint @ joint_cov.unsqueeze(-4) * seen.by_joint
+        variance = variance + 0.5 * _FARTHER**2 * spread.sum((-2, -1))
+    return -(2 * math.pi * variance).log()
 
 
 def assign(gains: Float[Tensor, "P C D"]) -> Int[Tensor, "P C"]:
