@@ -10,7 +10,7 @@ from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_files import UP_AXES
 
-__all__ = ["Lean", "Upright", "camera_up", "known_up"]
+__all__ = ["Lean", "Upright", "camera_up", "known_up", "upright_of"]
 
 # Of the upward direction in the axes of the pelvis, to the left and forward.
 _MEAN, _STD = (0.0, -0.1), (0.08, 0.08)
@@ -51,6 +51,17 @@ class Upright(NamedTuple):
         gap = self.mean - torch.stack([x, z], -1)
         far = (gap.square() / self.variance).sum(-1, keepdim=True)
         return Lean(gap, self.variance * (_FREEDOM + far) / (_FREEDOM + 2), jacobian)
+
+
+def upright_of(rig: CameraRig, up: str | None) -> Upright | None:
+    """Return what is expected of leans, None of several cameras where no axis is known to point up.
+
+    Raises:
+        InputError: an axis other than "y" and "z".
+    """
+    if up is not None:
+        return known_up(rig, up)
+    return camera_up(rig) if len(rig) == 1 else None
 
 
 def camera_up(rig: CameraRig) -> Upright:
