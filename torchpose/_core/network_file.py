@@ -50,4 +50,4 @@ def read_network(
         numbers = {name: value for name, value in network.state_dict().items() if not value.ndim}
         given = {name: value.float() for name, value in tensors.items()}
         network.load_state_dict(given | numbers)
-    return network.eval().requires_grad_(False)
+    return network.float().eval().requires_grad_(False)
