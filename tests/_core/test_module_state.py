@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 import torchpose
 from tests.whole_body.filters.bending_body import BODY, performances, space
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
+from tests.whole_body.keypoints.scenes import moving_body, ring
 from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
@@ -155,6 +156,24 @@ def follow_body(tracker):
     return poses.state, poses.covariance3d, tracker.upright.joints(walk(walker(), 2))
 
 
+def keypoint_tracker(count):
+    """Makes trackers by keypoints of some cameras and persons of two sizes."""
+
+    def make(seed):
+        rig = ring(count, 3.0 + seed)
+        return torchpose.BodyTracker(rig, "kalman", height=1.5 + 0.1 * seed, fps=10.0)
+
+    return make
+
+
+def follow_keypoints(tracker):
+    """With more cameras than one, one alone at first, which is tracked as if it were the only one."""
+    seen = ring(len(tracker.cameras))(moving_body(8)).pixels
+    seen[:, 1:] = torch.nan
+    track = tracker(keypoints=seen)
+    return track.joints3d, track.covariance3d
+
+
 def off_centre(by):
     """Centres of all parts but the root, which has none."""
     centres = torch.full_like(BODY.centres, by)
@@ -207,6 +226,8 @@ CASES = {
     ),
     "RootUncertaintyTracker": (root_tracker, follow_root),
     "BodyTracker": (body_tracker, follow_body),
+    "BodyTracker by keypoints": (keypoint_tracker(2), follow_keypoints),
+    "BodyTracker by keypoints of one camera": (keypoint_tracker(1), follow_keypoints),
     "PostureGate": (lambda s: PostureGate(BODY, actions(s)), state_of),
     "PinholeCamera": (
         lambda s: PinholeCamera(500 + s, 500, 320, 240, translation=(0, 0, s)),

@@ -101,6 +101,34 @@ def test_running_leaves_the_state_as_it_was_and_shares_no_memory(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_outputs_and_first_states_are_the_callers_to_write_to(kind):
+    model, z = make(kind, 1), measurements()
+    expected = [out.mean for out in steps(model, z)]
+    found = []
+    for out in steps(model, z):
+        found.append(out.mean.clone())
+        overwrite(out)
+    assert all(map(torch.equal, found, expected))
+    overwrite(model.init(2, generator=torch.Generator().manual_seed(0)))
+    assert all(map(torch.equal, (out.mean for out in steps(model, z)), expected))
+
+
+def steps(model, z):
+    """Yields the output of each frame."""
+    g = torch.Generator().manual_seed(0)
+    state = model.init(len(z), generator=g)
+    for frame in z.unbind(1):
+        state, out = model.step(state, frame, generator=g, return_cov=True)
+        yield out
+
+
+def overwrite(values):
+    for value in values:
+        if isinstance(value, torch.Tensor):
+            value.fill_(1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_was_used_is_pickled_and_copied_as_small_as_what_was_not(kind):
     model, fresh = make(kind, 1), make(kind, 1)
     expected = run(model)

@@ -159,6 +159,25 @@ def test_a_stream_goes_on_while_nothing_is_seen_and_says_for_how_long(prior, key
     assert float(pose.unseen) == 0
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_poses_are_the_callers_to_write_to(prior, few, method):
+    options = {"n_particles": 50} if "n_particles" in method_options(method) else {}
+    tracker = UpperBodyTracker(prior, demo_camera(), method=method, max_gap=None, **options)
+    few = few[:1, :8]
+    state = tracker.init(1, NAMES, torch.Generator().manual_seed(0))
+    for t in range(few.shape[1]):
+        state, pose = tracker.step(state, few[:, t])
+        found = pose.joints3d.clone()
+        for value in pose:
+            value.fill_(1)
+    given = (few, None, NAMES, None)
+    track = tracker(*given, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(found, track.joints3d[:, -1], rtol=1e-9, atol=1e-9)
+    track.matrix.mul_(0.5)  # the camera matrix of a smaller image
+    again = tracker(*given, torch.Generator().manual_seed(0))
+    assert torch.equal(again.joints2d, track.joints2d)
+
+
 def test_a_step_leaves_its_state_as_it_was(prior, keypoints):
     tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None)
     state, _ = stream(tracker, keypoints[:, :10])

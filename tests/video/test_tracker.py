@@ -95,6 +95,32 @@ def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person
     assert person.track.failed_at.tolist() == [-1]
 
 
+def live_poses(tracker, frames):
+    """Poses of all frames, one frame after the other."""
+    state, found = tracker.init(), []
+    for frame in frames:
+        state, people = tracker.step(state, frame)
+        found += [person.pose.joints3d for person in people]
+    return torch.cat(found)
+
+
+@pytest.mark.parametrize("hands", ["learnt", "mean-shift"])
+def test_precisions_of_the_program_change_nothing(prior, one_person, hands):
+    options = {"method": "mkf-fixed", "hands": hands}
+    frames = one_person[:8]
+    tracker = VideoTracker(prior, demo_camera(), **options)
+    expected = live_poses(tracker, frames)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(live_poses(tracker, frames), expected)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = live_poses(VideoTracker(prior, demo_camera(), **options), frames)
+    finally:
+        torch.set_default_dtype(before)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
 def test_two_who_cross_stay_who_they_are(prior, pair, two_persons):
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
     people = tracker(two_persons)

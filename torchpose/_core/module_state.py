@@ -1,9 +1,10 @@
 """Manage the state of modules: registered tensors, what is derived from them, and their precision."""
 
+import functools
 import threading
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Self, TypeVar, overload
+from typing import Any, NamedTuple, Self, TypeVar, cast, overload
 from weakref import WeakKeyDictionary
 
 import torch
@@ -13,6 +14,7 @@ from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
@@ -114,6 +116,17 @@ def one_run(device: torch.device) -> Iterator[None]:
             if _GRAPHS.depth == 0:
                 _GRAPHS.kept.clear()
                 _GRAPHS.traced.clear()
+
+
+def as_one_run(method: F) -> F:
+    """Run a method of a module in `one_run`, on the device of the module's tensors."""
+
+    @functools.wraps(method)
+    def run(self: nn.Module, *args: Any, **kwargs: Any) -> Any:
+        with one_run(next(self.buffers()).device):
+            return method(self, *args, **kwargs)
+
+    return cast(F, run)
 
 
 def derived(

@@ -53,4 +53,4 @@ class FittedNetwork(nn.Module):
             }
             given = {name: value.float() for name, value in tensors.items()}
             network.load_state_dict(given | numbers)
-        return network.eval().requires_grad_(False)
+        return network.float().eval().requires_grad_(False)

@@ -266,9 +266,9 @@ class MixtureKalmanFilter(RecursiveFilter):
         """
         check_count("batch_size", batch_size)
         return MKFState(
-            normalise(self.log_prior).to(self.dtype).expand(batch_size, -1),
-            self.means.to(self.dtype).expand(batch_size, -1, -1),
-            self.start_cov[None],
+            normalise(self.log_prior).to(self.dtype).repeat(batch_size, 1),
+            self.means.to(self.dtype).repeat(batch_size, 1, 1),
+            self.start_cov[None].clone(),
             torch.zeros(batch_size, dtype=torch.long, device=self.means.device),
             0,
         )

@@ -207,7 +207,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         resampled = systematic(log_weights, generator)
         needed = effective_sample_size(log_weights) < self.resample_threshold * self.n_tracks
         if values_visible() and not bool(needed.any()):
-            return log_weights, mean, cov
+            return log_weights.clone(), mean, cov  # those of the output are the caller's
         own = torch.arange(self.n_tracks, device=mean.device)
         index = torch.where(needed[:, None], resampled, own)
         rows = torch.arange(index.shape[0], device=mean.device)[:, None]

@@ -141,4 +141,4 @@ class HandAssociation(nn.Module):
 def _unknown(persons: int) -> AssociationState:
     """Return the state of persons without votes."""
     number = torch.zeros(persons, dtype=torch.long)
-    return AssociationState(torch.zeros(persons, 2), number > 0, number)
+    return AssociationState(torch.zeros(persons, 2, dtype=torch.float32), number > 0, number)

@@ -259,16 +259,16 @@ class Motion(nn.Module):
     def __init__(self, step: float = 0.7, rate: float = 1.0, flow: bool = True) -> None:
         super().__init__()
         self.limit, self.with_flow = step * rate, flow
-        self.register_buffer("channel_weights", torch.tensor([0.6, 1.0, 1.0]))
+        self.register_buffer("channel_weights", torch.tensor([0.6, 1.0, 1.0], dtype=torch.float32))
 
     channel_weights: Tensor
 
     def init(self, persons: int) -> MotionState:
         """Return the state before the first frame."""
         rows, columns = CELLS
-        small = torch.zeros(persons, 3, rows * EVIDENCE, columns * EVIDENCE)
+        small = torch.zeros(persons, 3, rows * EVIDENCE, columns * EVIDENCE, dtype=torch.float32)
         grey = torch.zeros(persons, rows * EVIDENCE, columns * EVIDENCE, dtype=torch.uint8)
-        flow = torch.zeros(*grey.shape, 2)
+        flow = torch.zeros(*grey.shape, 2, dtype=torch.float32)
         return MotionState(small, small, grey, flow, torch.zeros(persons, dtype=torch.long))
 
     def move(

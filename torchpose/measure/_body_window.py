@@ -211,7 +211,7 @@ def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) 
     place, share = torch.tensor(anchors, dtype=torch.float64).view(-1, 3), []
     sizes = ((CELLS[0], _TOP, 1, height), (CELLS[1], _LEFT, 0, width))
     for count, first, axis, pixels in sizes:
-        edge = torch.arange(count * per_cell + 1) * (CELL / per_cell) + first
+        edge = torch.arange(count * per_cell + 1, dtype=torch.float32) * (CELL / per_cell) + first
         at = place[:, axis, None] + edge * place[:, 2:] + 0.5
         at = at.clamp(0, pixels)
         share.append((at.diff(dim=1) / (place[:, 2:] * CELL / per_cell)).clamp_max(1))
@@ -223,8 +223,8 @@ def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) 
 def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
     """Return the places (x, y) of the cells (or of their finer pixels), in B from the anchor."""
     rows, columns = CELLS[0] * per_cell, CELLS[1] * per_cell
-    x = _LEFT + (torch.arange(columns) + 0.5) * (CELL / per_cell)
-    y = _TOP + (torch.arange(rows) + 0.5) * (CELL / per_cell)
+    x = _LEFT + (torch.arange(columns, dtype=torch.float32) + 0.5) * (CELL / per_cell)
+    y = _TOP + (torch.arange(rows, dtype=torch.float32) + 0.5) * (CELL / per_cell)
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
 
 

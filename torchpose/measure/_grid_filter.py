@@ -99,9 +99,9 @@ def _carry(belief: Float[Tensor, "N 2 h w"], flow: Float[Tensor, "N h w 2"]) -> 
 @outside_inference()
 def _whole_grid(height: int, width: int) -> tuple[Tensor, Tensor]:
     """Return the places of all cells as `grid_sample` takes them, and how far apart these are [h, w, 2]."""
-    x, y = (2 * torch.arange(n) + 1 for n in (width, height))
+    x, y = (2 * torch.arange(n, dtype=torch.float32) + 1 for n in (width, height))
     start = torch.stack(torch.broadcast_tensors(x / width - 1, (y / height - 1)[:, None]), -1)
-    scale = torch.tensor([2 / width, 2 / height]).expand_as(start)
+    scale = start.new_tensor([2 / width, 2 / height]).expand_as(start)
     return start.contiguous(), scale.contiguous()
 
 
@@ -155,7 +155,7 @@ def _occupied(
 @outside_inference()
 def _side_matrix(size: int, soft: float, hand: int) -> Tensor:
     """Return the matrix from columns of the other hand to how far each column is on its wrong side."""
-    left_of = gaussian_matrix(size, soft) @ torch.ones(size, size).tril()
+    left_of = gaussian_matrix(size, soft) @ torch.ones(size, size, dtype=torch.float32).tril()
     return (1 - left_of if hand == 0 else left_of).mT.contiguous()
 
 
@@ -220,7 +220,7 @@ def gaussian_matrix(
 @outside_inference()
 def _still_matrix(size: int, sigma: float) -> Tensor:
     """Return `gaussian_matrix` without a shift, cached."""
-    return _gaussian(size, sigma, torch.zeros(1))
+    return _gaussian(size, sigma, torch.zeros(1, dtype=torch.float32))
 
 
 def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:

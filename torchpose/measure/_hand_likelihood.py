@@ -16,7 +16,8 @@ from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, cell_centres, halve
 from torchpose.measure._face import check_faces
 
-_ACROSS = torch.tensor([-1.0, 1.0])[:, None, None]  # turns (y, x) into the vector across
+# turns (y, x) into the vector across
+_ACROSS = torch.tensor([-1.0, 1.0], dtype=torch.float32)[:, None, None]
 
 
 class HandLikelihood(nn.Module):
@@ -56,13 +57,18 @@ class HandLikelihood(nn.Module):
     ) -> None:
         super().__init__()
         self.unknown = unknown
-        self.register_buffer("cues", torch.tensor([core, disc, motion, unusual]))
+        self.register_buffer(
+            "cues", torch.tensor([core, disc, motion, unusual], dtype=torch.float32)
+        )
         weights = [-beyond, towards, -beside, -beside]
         offsets = [[-beyond_at, 0.0], [towards_at, 0.0], [0.0, -beside_at], [0.0, beside_at]]
         used = [i for i, weight in enumerate(weights) if weight]
-        self.register_buffer("shape_weights", torch.tensor([weights[i] for i in used]))
         self.register_buffer(
-            "shape_offsets", torch.tensor([offsets[i] for i in used]).reshape(-1, 2)
+            "shape_weights", torch.tensor([weights[i] for i in used], dtype=torch.float32)
+        )
+        self.register_buffer(
+            "shape_offsets",
+            torch.tensor([offsets[i] for i in used], dtype=torch.float32).reshape(-1, 2),
         )
         for name, count in (("rows", CELLS[0]), ("columns", CELLS[1])):
             self.register_buffer(f"palm_{name}", _palm_matrix(count, palm))
@@ -153,8 +159,8 @@ def _grid() -> tuple[Tensor, Tensor, Tensor]:
 
 def _palm_matrix(cells: int, palm: float) -> Tensor:
     """Return the matrix of means over `palm` about the middle of each cell."""
-    centre = (torch.arange(cells)[:, None] + 0.5) * CELL
-    edge = torch.arange(cells + 1) * CELL
+    centre = (torch.arange(cells, dtype=torch.float32)[:, None] + 0.5) * CELL
+    edge = torch.arange(cells + 1, dtype=torch.float32) * CELL
     edge[0], edge[-1] = -palm, edge[-1] + palm  # the border counts for what is beyond it
     part = edge[None].clamp(min=centre - palm / 2, max=centre + palm / 2).diff(dim=1)
     return part / part.sum(1, keepdim=True)

@@ -255,8 +255,8 @@ class HandTracker(nn.Module):
         """Return the state of new persons."""
         number = torch.zeros(count, dtype=torch.long)
         nowhere = torch.full((count, 2, 2), torch.nan, dtype=torch.float64)
-        even = torch.full((count, 2, *CELLS), 1 / math.prod(CELLS))
-        gone = torch.full((count, 2), _UNKNOWN if self.network else 0.0)
+        even = torch.full((count, 2, *CELLS), 1 / math.prod(CELLS), dtype=torch.float32)
+        gone = torch.full((count, 2), _UNKNOWN if self.network else 0.0, dtype=torch.float32)
         return HandBeliefs(
             number, self.skin.init(count), self.memory.init(count), even, gone,
             nowhere, torch.zeros_like(nowhere), number.clone(),

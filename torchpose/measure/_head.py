@@ -158,10 +158,15 @@ class FaceMemory(nn.Module):
         super().__init__()
         self.deviations, self.floor, self.median, self.scale = deviations, floor, median, scale
         self.align, self.rate, self.remember = align, rate, remember
-        self.register_buffer("channel_weights", torch.tensor([0.5, 1.0, 1.0]).view(3, 1, 1))
+        self.register_buffer(
+            "channel_weights", torch.tensor([0.5, 1.0, 1.0], dtype=torch.float32).view(3, 1, 1)
+        )
         self.register_buffer("blur_rows", _box(_ROWS, _BLUR))
         self.register_buffer("blur_columns", _box(_COLUMNS, _BLUR).T.contiguous())
-        self.register_buffer("pixel", torch.tensor([2 * _HALF_WIDTH / _COLUMNS, _HEIGHT / _ROWS]))
+        self.register_buffer(
+            "pixel",
+            torch.tensor([2 * _HALF_WIDTH / _COLUMNS, _HEIGHT / _ROWS], dtype=torch.float32),
+        )
 
     channel_weights: Tensor
     blur_rows: Tensor
@@ -228,10 +233,10 @@ class FaceMemory(nn.Module):
         self, state: FaceMemoryState, error: Tensor, difference: Tensor, in_front: Tensor
     ) -> FaceMemoryState:
         frames = state.frames + 1
-        limit = torch.where(in_front, 0.05 * self.rate, 0.15 * self.rate)
+        limit = torch.where(in_front, error.new_tensor(0.05 * self.rate), 0.15 * self.rate)
         step = torch.minimum(torch.maximum(error, -limit), limit)
         if bool((frames <= _FIRST).any()):
-            share = torch.where(in_front, 0.004, 1 / (frames + 1.0)[:, None, None, None])
+            share = torch.where(in_front, 0.004, 1 / (frames.to(error) + 1)[:, None, None, None])
             step = torch.where((frames <= _FIRST)[:, None, None, None], share * error, step)
         excess = (difference - state.deviation).clamp_(-0.2, 0.2)
         deviation = state.deviation.add(excess, alpha=0.05 * self.rate)
@@ -257,14 +262,21 @@ def _box(size: int, width: int) -> Tensor:
     place = torch.arange(size)[:, None] + torch.arange(width) - width // 2
     place = place.abs()
     place = torch.where(place >= size, 2 * (size - 1) - place, place)
-    return torch.zeros(size, size).scatter_add_(1, place, torch.ones(size, width)) / width
+    return (
+        torch.zeros(size, size, dtype=torch.float32).scatter_add_(
+            1, place, torch.ones(size, width, dtype=torch.float32)
+        )
+        / width
+    )
 
 
 @cache
 @outside_inference()
 def _patch_places() -> Tensor:
-    x = (torch.arange(_COLUMNS) + 0.5) * (2 * _HALF_WIDTH / _COLUMNS) - _HALF_WIDTH
-    y = (torch.arange(_ROWS) + 0.5) * (_HEIGHT / _ROWS) + _TOP
+    x = (torch.arange(_COLUMNS, dtype=torch.float32) + 0.5) * (
+        2 * _HALF_WIDTH / _COLUMNS
+    ) - _HALF_WIDTH
+    y = (torch.arange(_ROWS, dtype=torch.float32) + 0.5) * (_HEIGHT / _ROWS) + _TOP
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
 
 
@@ -342,7 +354,7 @@ def _to_window(patch: Tensor, at: Tensor) -> Tensor:
 @outside_inference()
 def _window_grid() -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """Return the columns and rows of `head_part` in halves of the patch, its middle, and these halves."""
-    half = torch.tensor([_HALF_WIDTH, _HEIGHT / 2])
+    half = torch.tensor([_HALF_WIDTH, _HEIGHT / 2], dtype=torch.float32)
     places = cell_centres(EVIDENCE)[head_part(EVIDENCE)] / half
     columns, rows = places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
-    return (columns, rows), torch.tensor([0.0, _TOP + _HEIGHT / 2]), half
+    return (columns, rows), half.new_tensor([0.0, _TOP + _HEIGHT / 2]), half

@@ -138,8 +138,8 @@ class MeanShiftHandTracker(nn.Module):
         self.acceleration, self.spread = acceleration, spread
         self.skin = SkinModel() if skin is None else skin
         self.prior = prior
-        eye = torch.eye(2)
-        self.register_buffer("matrix", torch.kron(torch.tensor([[1.0, 1.0], [0.0, 1.0]]), eye))
+        eye = torch.eye(2, dtype=torch.float32)
+        self.register_buffer("matrix", torch.kron(eye.new_tensor([[1.0, 1.0], [0.0, 1.0]]), eye))
         drive = torch.cat([0.5 * eye, eye])  # a constant acceleration within a frame
         self.register_buffer("drive", drive @ drive.mT)
         self.register_buffer("observed", torch.arange(2))

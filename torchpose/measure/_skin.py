@@ -116,8 +116,8 @@ class SkinModel(nn.Module):
             )
         self.slope, self.bias, self.decay = slope, bias, decay
         self.floor, self.clothes_share = floor, clothes_share
-        self.register_buffer("lowest", torch.tensor(_LOWEST))
-        self.register_buffer("width", torch.tensor(_WIDTH))
+        self.register_buffer("lowest", torch.tensor(_LOWEST, dtype=torch.float32))
+        self.register_buffer("width", torch.tensor(_WIDTH, dtype=torch.float32))
         for axis, kernel in enumerate(_KERNELS):
             self.register_buffer(f"smooth{axis}", _band(BINS[axis], kernel))
 
@@ -251,7 +251,7 @@ def _each(matrix: Float[Tensor, "r r"], values: Float[Tensor, "N r c"]) -> Float
 
 def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
     """Return the symmetric matrix of a convolution with a symmetric kernel, zero beyond the ends."""
-    middle, eye = len(kernel) // 2, torch.eye(size)
+    middle, eye = len(kernel) // 2, torch.eye(size, dtype=torch.float32)
     rows = torch.nn.functional.pad(eye, (middle, middle))
     return sum(  # type: ignore[return-value]
         weight * rows[:, i : i + size] for i, weight in enumerate(kernel)

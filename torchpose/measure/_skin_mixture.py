@@ -92,7 +92,7 @@ class SkinMixtureModel(nn.Module):
             )
         self.n_components, self.every, self.steps = n_components, every, steps
         self.decay, self.floor, self.even = decay, floor, even
-        place = (torch.arange(_SAMPLES) + 0.5) / _SAMPLES
+        place = (torch.arange(_SAMPLES, dtype=torch.float32) + 0.5) / _SAMPLES
         across = (2 * place - 1) * FACE_PATCH[0]
         down = FACE_PATCH[1] + place * (FACE_PATCH[2] - FACE_PATCH[1])
         grid = torch.stack(torch.broadcast_tensors(across, down[:, None]), -1)

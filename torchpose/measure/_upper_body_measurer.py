@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
+from torchpose._core.module_state import as_one_run
 from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
 from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, scaled_back
@@ -189,6 +190,7 @@ class UpperBodyMeasurer(nn.Module):
             return MeasurerState(seen._replace(windows=windows), beliefs)
         return MeasurerState(seen, self.hand_tracker.init())
 
+    @as_one_run
     def look(self, seen: SeenPersons, image: Image) -> PersonsView:
         """Return what the next frame shows of the persons, apart from beliefs about their hands.
 
@@ -230,6 +232,7 @@ class UpperBodyMeasurer(nn.Module):
             grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         return self.face_tracker.step(tracks, np.asarray(grey, dtype=np.uint8))
 
+    @as_one_run
     def step(
         self,
         state: MeasurerState,

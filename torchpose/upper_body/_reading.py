@@ -137,7 +137,7 @@ class PoseReader(NamedTuple):
                 [out.effective_sample_size.double() for out in (left, right)], -1
             ),
             lengths=lengths,
-            matrix=self.camera.matrix,
+            matrix=self.camera.matrix.clone(),
             failed_at=first_failure(left, right),
             fps=self.fps,
             frame=self.frame,

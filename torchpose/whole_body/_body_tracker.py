@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_rate, check_shape
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
-from torchpose._core.module_state import in_own_precision
+from torchpose._core.module_state import as_one_run, in_own_precision
 from torchpose._core.moved import warn_of_former
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
@@ -179,12 +179,12 @@ class BodyTracker(nn.Module):
             _refuse(unused, f"for method {method}")
             self.method, self.fps = method, float(fps)
             person = body if body is None or isinstance(body, Body) else load_body(body)
+            self.cameras, self.n_particles = rig, 0
             self.by_keypoints = KeypointBodyTracker(
                 rig, fps, body=person, height=height,
                 motion=load_body_motion(motion) if isinstance(motion, str | Path) else motion,
                 keypoint_std=keypoint_std, pixel_std=pixel_std, up=up,
             )  # fmt: skip
-            self.cameras, self.n_particles = self.by_keypoints.rig, 0
             return
         unused = [name for name, value in (("motion", motion), ("up", up)) if value is not None]
         _refuse(unused, f"without method={KEYPOINT_METHOD!r}")
@@ -256,6 +256,7 @@ class BodyTracker(nn.Module):
 
     @takes_former_arguments
     @torch.no_grad()
+    @as_one_run
     def forward(
         self,
         silhouettes: Iterable[Bool[Tensor, "C H W"]] | None = None,
@@ -365,6 +366,7 @@ class BodyTracker(nn.Module):
 
     @takes_former_arguments
     @torch.no_grad()
+    @as_one_run
     def init(
         self,
         silhouettes: Bool[Tensor, "T C H W"] | None = None,
@@ -446,6 +448,7 @@ class BodyTracker(nn.Module):
     ) -> tuple[BodyStream, list[BodyTrack]]: ...
 
     @torch.no_grad()
+    @as_one_run
     def step(
         self,
         state: BodyStream,
@@ -496,6 +499,7 @@ class BodyTracker(nn.Module):
         return state._replace(filter=after, frame=state.frame + 1), pose
 
     @torch.no_grad()
+    @as_one_run
     def advance(
         self,
         state: BodyStream,

@@ -14,7 +14,7 @@ from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._following import Observed
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS
 from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 
@@ -66,7 +66,7 @@ class BodyKeypointMeasurer:
         keypoint_std: float | None,
         pixel_std: float | None,
     ) -> None:
-        self.body, self.maps = body, RigMaps.of(rig)
+        self.body = body
         self.tracker = KeypointBodyTracker(
             rig, fps, body=body, keypoint_std=keypoint_std, pixel_std=pixel_std
         )
@@ -82,7 +82,8 @@ class BodyKeypointMeasurer:
 
     def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
         """Return the measurement of one frame, of one element."""
-        return KeypointMeasurement(frames.map(lambda v: v[t : t + 1]), self.maps)
+        maps = self.tracker.tracker.filter.maps
+        return KeypointMeasurement(frames.map(lambda v: v[t : t + 1]), maps)
 
     def first_frame(self, frames: KeypointFrame) -> int:
         """Return the first frame with enough joints for a first pose: the one in which "kalman" begins.

@@ -1,7 +1,7 @@
 """Begin and follow one person with a particle filter, through silhouettes, keypoints, or both."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.module_state import derived
 from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
@@ -46,7 +47,6 @@ class ParticleFollower:
     start_body: Body | None
     start_prior: Any
     noise: tuple[float | None, float | None]
-    _measurer: BodyKeypointMeasurer | None = field(default=None, init=False)
 
     @property
     def upright(self) -> Body:
@@ -62,9 +62,11 @@ class ParticleFollower:
     @property
     def measurer(self) -> BodyKeypointMeasurer:
         """Return what makes measurements of keypoints; it is set up by the first ones."""
-        if self._measurer is None:
-            self._measurer = BodyKeypointMeasurer(self.cameras, self.fps, self.upright, *self.noise)
-        return self._measurer
+        sources = (*self.upright.buffers(), *self.cameras.buffers())
+        return derived(
+            self.filter, "measurer", sources,
+            lambda: BodyKeypointMeasurer(self.cameras, self.fps, self.upright, *self.noise),
+        )  # fmt: skip
 
     def observed(
         self, silhouettes: Iterable[Tensor] | None, given: GivenKeypoints | None

@@ -423,6 +423,7 @@ def test_a_known_body_keeps_its_bones(four, filtered):
     [
         ({"keypoints": torch.zeros(3, 2, 15, 2)}, ShapeError, "keypoints"),
         ({"keypoints": torch.full((3, 4, 15, 2), torch.nan)}, NobodySeenError, "no keypoint"),
+        ({"keypoints": torch.zeros(0, 3, 4, 15, 2)}, InputError, "at least one sequence"),
         ({"names": ["nose"] * 15}, SkeletonError, "nose"),
         ({"confidence": torch.full((40, 4, 15), -1.0)}, InputError, "in \\[0, 1\\]"),
         ({"confidence": torch.ones(40, 4, 3)}, ShapeError, "confidence"),

@@ -165,17 +165,16 @@ def test_a_body_is_placed_on_its_rays_beside_a_wild_one():
 def test_a_larger_person_is_lifted_larger_and_few_keypoints_are_not_lifted():
     motion = load_body_motion("whole-body")
     rig, pixels = ring(1), ring(1)(moving_body(1)).pixels
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    usual = PoseLifter(rig, FPS, motion, up)(frame_of(pixels), None)[0]
+    usual = PoseLifter(rig, FPS, motion, "y")(frame_of(pixels), None)[0]
     large = with_body(motion, Body.of_height(BODY_15, 2.1))
-    other = PoseLifter(rig, FPS, large, up)(frame_of(pixels), None)[0]
+    other = PoseLifter(rig, FPS, large, "y")(frame_of(pixels), None)[0]
     ratio = other.std / usual.std
     torch.testing.assert_close(ratio, ratio[:1, :1].expand_as(ratio))
     torch.testing.assert_close(other.joints, ratio[0, 0] * usual.joints)
     assert 1.1 < float(ratio[0, 0]) < 1.4
     few = frame_of(pixels)
     few.inlier[..., 5:] = 0
-    assert bool(PoseLifter(rig, FPS, motion, up)(few, None)[0].std.isinf().all())
+    assert bool(PoseLifter(rig, FPS, motion, "y")(few, None)[0].std.isinf().all())
 
 
 def test_a_camera_on_its_side_lifts_the_same_where_up_is_known():
@@ -183,9 +182,8 @@ def test_a_camera_on_its_side_lifts_the_same_where_up_is_known():
     frame = frame_of(rig(moving_body(1)).pixels)
     rolled = quarter_turned(rig)
     turned = frame._replace(pixels=rolled(moving_body(1)).pixels)
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     usual, on_side = (
-        PoseLifter(one, FPS, motion, up)(given, None)[0]
+        PoseLifter(one, FPS, motion, "y")(given, None)[0]
         for one, given in ((rig, frame), (rolled, turned))
     )
     torch.testing.assert_close(on_side.joints, usual.joints, atol=1e-4, rtol=0)

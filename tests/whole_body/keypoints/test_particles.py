@@ -1,11 +1,12 @@
 """Particle filters over bodies that keypoints weigh."""
 
 import math
+import pickle
 
 import pytest
 import torch
 
-from tests.whole_body.keypoints.scenes import errors, scene
+from tests.whole_body.keypoints.scenes import errors, ring, scene
 from torchpose import BodyTracker
 from torchpose.body import BODY_15, Body
 from torchpose.body._skeleton import other_side
@@ -171,6 +172,36 @@ def test_init_step_and_advance_give_the_numbers_of_forward():
     state, one = tracker.step(state, keypoints=seen.keypoints[0], confidence=seen.confidence[0])
     _, rest = tracker.advance(state, keypoints=seen.keypoints[1:], confidence=seen.confidence[1:])
     assert torch.equal(torch.cat([one.state, rest.state]), whole.state)
+
+
+def test_a_loaded_state_reaches_what_keypoints_are_measured_by():
+    seen = scene(cameras=2, n_frames=3)
+    given = {"keypoints": seen.keypoints, "confidence": seen.confidence}
+    options = {"height": 1.7, "fps": 10, "n_particles": 30}
+    tracker = BodyTracker(seen.rig, "sir", **options)
+    size = len(pickle.dumps(tracker))
+    expected = tracker(**given, generator=torch.Generator().manual_seed(0)).state
+    assert len(pickle.dumps(tracker)) == size
+    other = BodyTracker(ring(2, 5.0), "sir", **options)
+    other(**given, generator=torch.Generator().manual_seed(0))
+    other.load_state_dict(tracker.state_dict())
+    again = other(**given, generator=torch.Generator().manual_seed(0)).state
+    assert torch.equal(again, expected)
+
+
+@pytest.mark.parametrize("method", ["kalman", "sir"])
+def test_autocast_changes_nothing(method):
+    seen = scene(cameras=1, n_frames=3)
+    options = {} if method == "kalman" else {"n_particles": 30}
+    tracker = BodyTracker(seen.rig, method, height=1.7, fps=30, **options)
+    seeds = (
+        {} if method == "kalman" else {"generator": torch.Generator().manual_seed(0)}
+        for _ in range(2)
+    )
+    expected = tracker(keypoints=seen.keypoints, **next(seeds))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = tracker(keypoints=seen.keypoints, **next(seeds))
+    assert torch.equal(found.joints3d, expected.joints3d)
 
 
 def test_silhouettes_and_keypoints_add():

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+import torchpose
 from tests.whole_body.keypoints.scenes import ring, scene
 from torchpose.body import BODY_15
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -22,7 +23,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     weigh,
 )
-from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_height
 from torchpose.whole_body._keypoints.upright import camera_up
 
@@ -105,7 +105,7 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     new = point.position.new_full
     state = BodyGaussian(point, cov, new((1, 3, 2), -50.0), new((1, 3), 1.0), new((1, 15), -5.0))
     frame = frame_of(given)
-    found = BodyKalmanFilter(motion, maps, 30.0).correct(state, frame, (1.0,))
+    found = BodyKalmanFilter(motion, given.rig, 30.0).correct(state, frame, (1.0,))
 
     joints, jacobian = body.linearise(point)
     seen = see(maps, joints)
@@ -186,12 +186,9 @@ def test_who_bends_far_is_expected_upright_with_less_force():
 
 
 def test_constants_move_with_the_filter(motion):
-    def tensors(value):
-        if isinstance(value, torch.Tensor):
-            return [value]
-        return [t for part in value for t in tensors(part)] if isinstance(value, tuple) else []
-
-    filter = KeypointTracker(ring(1), 30.0, load_body_motion("whole-body")).to("meta").filter
-    found = [t for value in vars(filter).values() for t in tensors(value)]
-    found += list(filter.buffers())
+    tracker = torchpose.BodyTracker(ring(1), "kalman", motion=motion)
+    filter = tracker.by_keypoints.tracker.filter
+    assert filter.maps.matrix.device.type == "cpu"
+    tracker.to("meta")
+    found = [*filter.maps, *filter.upright, *filter.exchange, *tracker.buffers()]
     assert len(found) > 20 and {t.device.type for t in found} == {"meta"}

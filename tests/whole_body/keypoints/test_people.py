@@ -91,6 +91,17 @@ def test_live_has_the_same_numbers():
         assert int(last.details["person"]) == int(one.details["person"][-1])
 
 
+def test_a_frame_in_which_no_camera_detects_anybody_is_one_of_missing_keypoints():
+    rig, _, pixels = passing(2)
+    found = []
+    for nobody in (pixels[0, :, :0], torch.full_like(pixels[0], torch.nan)):
+        one, state = tracker(rig), tracker(rig).init()
+        for frame in (nobody, *pixels[:6], nobody, nobody, *pixels[9:11]):
+            state, poses = one.step(state, keypoints=frame, persons="all")
+        found.append(torch.cat([pose.joints3d for pose in poses]))
+    assert len(found[0]) == 2 and torch.equal(*found)
+
+
 def test_who_enters_late_and_leaves_is_tracked_while_there():
     rig, _, pixels = passing(3)
     pixels[:10, :, 1] = math.nan

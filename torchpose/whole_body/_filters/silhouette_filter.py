@@ -21,6 +21,7 @@ from torchpose._core.checks import (
     check_shape,
 )
 from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
+from torchpose._core.module_state import as_one_run
 from torchpose._core.moved import warn_of_former
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
@@ -183,6 +184,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
 
     @takes_former_arguments
     @torch.no_grad()
+    @as_one_run
     def init(
         self,
         initial_state: Float[Tensor, "*B D"],
@@ -203,7 +205,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         Raises:
             ShapeError: other sizes. InputError: NaN or infinite numbers, a list of another length.
         """
-        start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
+        start = initial_state.to(self.step_std, copy=True).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
         check_finite("initial_state", start)
         check_generators(generator, len(start))
@@ -292,6 +294,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         self.warn(without_repeats(track, lengths))
         return state, track
 
+    @as_one_run
     def filter_frame(
         self,
         state: BodyFilterState,
@@ -322,7 +325,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         mean = torch.where(dead[:, None], state.mean, mean)
         evidence = torch.where(frame.seen, moved.log_evidence, 0.0)  # exactly: without rounding
         out = BodyFilterOutput(
-            mean, torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
+            mean.clone(), torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
             self.spread(particles, log_weights, mean, moved.memory),
             effective_sample_size(log_weights), ~frame.seen, dead, moved.details or {},
         )  # fmt: skip

@@ -15,20 +15,27 @@ Cholesky factors of I + L^T G L.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived
 from torchpose.body._articulation import BodyPoint
+from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
-from torchpose.whole_body._keypoints.body_transition import jump_variance, transition
+from torchpose.whole_body._keypoints.body_transition import (
+    BodyTransition,
+    jump_variance,
+    transition,
+)
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     NOISE_SCALES,
     Beliefs,
+    Exchange,
     KeypointFrame,
     RigMaps,
     Seen,
@@ -41,7 +48,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 from torchpose.whole_body._keypoints.nested import mapped, taken
-from torchpose.whole_body._keypoints.upright import Upright
+from torchpose.whole_body._keypoints.upright import Upright, upright_of
 
 _JITTER = (
     1e-9  # share of a joint's information that is added along every axis, so that it has a factor
@@ -136,31 +143,57 @@ class BodyKalmanFilter(nn.Module):
     """Filters Gaussians over body states from keypoints in C cameras.
 
     Args:
-        motion: how bodies move. maps: the cameras. fps: frames per second. n_iterations: of a correction.
-        upright: how people lean, if it is known which way is up.
+        motion: how bodies move. rig: the cameras. fps: frames per second. n_iterations: of a correction.
+        up: "y" or "z", the axis of the world that points up; without it one camera is taken to be level.
     """
 
     def __init__(
         self,
         motion: BodyMotion,
-        maps: RigMaps,
+        rig: CameraRig,
         fps: float,
         n_iterations: int = 3,
-        upright: Upright | None = None,
+        up: str | None = None,
     ) -> None:
         super().__init__()
-        self.motion, self.maps, self.fps, self.n_iterations = motion, maps, fps, n_iterations
-        self.articulation, self.upright = motion.articulation, upright
-        self.exchange = exchange_of(self.articulation.skeleton, motion.acceleration.device)
-        self.transition = transition(motion, 1 / fps)
-        self._jump_variance = jump_variance(motion)
+        self.motion, self.fps, self.n_iterations, self.up = motion, fps, n_iterations, up
+        self.articulation = motion.articulation
+        self._rig = (rig,)  # a tuple, so that its tensors are held once
+        upright_of(rig, up)  # raises errors of the axis before any work
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move constants with the buffers, as `to` asks for."""
-        super()._apply(fn, recurse)
-        for name in ("maps", "upright", "exchange", "transition", "_jump_variance"):
-            setattr(self, name, mapped(_of_tensors(fn), getattr(self, name)))
-        return self
+    @property
+    def maps(self) -> RigMaps:
+        """Return the maps from world axes to pixels."""
+        rig = self._rig[0]
+        sources = (rig.matrix, rig.rotation, rig.translation)
+        return derived(self, "maps", sources, lambda: RigMaps.of(rig))
+
+    @property
+    def upright(self) -> Upright | None:
+        """Return how people lean, if it is known which way is up."""
+        rig = self._rig[0]
+        return derived(self, "upright", (rig.rotation,), lambda: upright_of(rig, self.up))
+
+    @property
+    def exchange(self) -> Exchange:
+        """Return the groups of joints whose sides may be exchanged."""
+        skeleton, like = self.articulation.skeleton, self.motion.acceleration
+        return derived(self, "exchange", (like,), lambda: exchange_of(skeleton, like.device))
+
+    @property
+    def transition(self) -> BodyTransition:
+        """Return the model of one frame."""
+        motion = self.motion
+        sources = (
+            motion.acceleration, motion.decay, motion.shift_std, motion.shift_time, motion.pull_time,
+        )  # fmt: skip
+        return derived(self, "transition", sources, lambda: transition(motion, 1 / self.fps))
+
+    @property
+    def _jump_variance(self) -> Float[Tensor, " N"]:
+        """Return the variances that a part gets whose joint is elsewhere than predicted."""
+        motion = self.motion
+        return derived(self, "jump", (motion.acceleration,), lambda: jump_variance(motion))
 
     def predict(self, state: BodyGaussian) -> BodyGaussian:
         """Return the Gaussian one frame later."""
@@ -380,11 +413,6 @@ class BodyKalmanFilter(nn.Module):
         doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
-
-
-def _of_tensors(fn: Callable[[Tensor], Tensor]) -> Callable[[Any], Any]:
-    """Return a function that leaves what is no tensor as it is."""
-    return lambda value: fn(value) if isinstance(value, Tensor) else value
 
 
 def _plus_one(matrix: Tensor) -> Tensor:

@@ -51,7 +51,6 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
-from torchpose.whole_body._keypoints.upright import known_up
 
 KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
@@ -92,7 +91,7 @@ class KeypointBodyTracker(nn.Module):
         up: str | None = None,
     ) -> None:
         super().__init__()
-        self.rig, self.fps = rig, float(fps)
+        self._rig, self.fps = (rig,), float(fps)  # a tuple: its tensors are those of who gives it
         alone = len(rig) == 1
         std_of_one = _KEYPOINT_STD_OF_ONE if keypoint_std is None else keypoint_std
         if keypoint_std is None:
@@ -108,11 +107,15 @@ class KeypointBodyTracker(nn.Module):
             motion = of_one_camera(motion)
         self.sized = body is not None or height is not None
         lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
-        known = None if up is None else known_up(rig, up)
         self.tracker = KeypointTracker(
-            rig, self.fps, motion, upright=known, lasting_std=lasting,
+            rig, self.fps, motion, up=up, lasting_std=lasting,
             lone=LoneNoise((std_of_one / self.keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
         )  # fmt: skip
+
+    @property
+    def rig(self) -> CameraRig:
+        """Return the cameras."""
+        return self._rig[0]
 
     @torch.no_grad()
     def forward(
@@ -133,6 +136,10 @@ class KeypointBodyTracker(nn.Module):
         if keypoints.ndim not in (4, 5):
             raise ShapeError(
                 f"keypoints must have shape [T, C, J, 2] or [B, T, C, J, 2], got {list(keypoints.shape)}"
+            )
+        if keypoints.ndim == 5 and len(keypoints) == 0:
+            raise InputError(
+                f"keypoints must hold at least one sequence, got {list(keypoints.shape)}"
             )
         frames = self.frames(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
@@ -194,7 +201,7 @@ class KeypointBodyTracker(nn.Module):
 
         def track(rig: CameraRig, moved: KeypointFrame, smooth: bool) -> KeypointPoses:
             tracker = KeypointTracker(
-                rig, self.fps, former.motion, upright=former.upright, lone=self.tracker.lone
+                rig, self.fps, former.motion, up=former.up, lone=self.tracker.lone
             )
             # the frames are those from the first one on that may begin: it has waited already
             return tracker(moved.map(lambda value: value[None]), smooth, progress, waited=math.inf)

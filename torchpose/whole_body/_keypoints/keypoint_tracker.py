@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.module_state import derived
 from torchpose.body._articulation import BodyPoint
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
@@ -18,7 +19,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
 from torchpose.whole_body._keypoints.known_person import of_one_camera, std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, contradicts, corrected_by
@@ -33,7 +34,6 @@ from torchpose.whole_body._keypoints.lone_camera import (
     state_of,
 )
 from torchpose.whole_body._keypoints.nested import mapped, taken
-from torchpose.whole_body._keypoints.upright import Upright, camera_up
 
 LEAST_JOINTS = 6  # that are measured where tracking begins
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
@@ -90,7 +90,7 @@ class KeypointTracker(nn.Module):
 
     Args:
         rig: the cameras. fps: frames per second. motion: how bodies move. n_iterations: of a correction.
-        upright: how people lean, if it is known which way is up; with one camera, this is taken to be level.
+        up: "y" or "z", the axis of the world that points up; without it one camera is taken to be level.
         lasting_std: metres, of what is wrong with joints for so long that frames do not average it out, along
             each axis; covariances of joints have it on top.
         lone: noise where one of several cameras alone sees a person.
@@ -102,19 +102,15 @@ class KeypointTracker(nn.Module):
         fps: float,
         motion: BodyMotion,
         n_iterations: int = 3,
-        upright: Upright | None = None,
+        up: str | None = None,
         lasting_std: float = 0.0,
         lone: LoneNoise = SAME_NOISE,
     ) -> None:
         super().__init__()
         self.lasting_std, self.lone = lasting_std, lone
         self._rig = (rig,)  # a tuple, so that its tensors are held once
-        self._lone_trackers: dict[int, KeypointTracker] = {}
-        self.lifter: PoseLifter | None = None
-        if len(rig) == 1:
-            upright = camera_up(rig) if upright is None else upright
-            self.lifter = PoseLifter(rig, fps, motion, upright.direction)
-        self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations, upright)
+        self.lifter = PoseLifter(rig, fps, motion, up) if len(rig) == 1 else None
+        self.filter = BodyKalmanFilter(motion, rig, fps, n_iterations, up)
 
     def forward(
         self,
@@ -248,7 +244,7 @@ class KeypointTracker(nn.Module):
         stream, pose, found = step
         own = None if before is None else self._own(before, camera)
         seen = frame_of(frame, camera, self.lone.widening)
-        after, one, by_one = self._lone_tracker(camera, frame).advance(own, seen)
+        after, one, by_one = self._lone_tracker(camera).advance(own, seen)
         state = by_one.state._replace(
             log_odds=into_all(found.state.log_odds, by_one.state.log_odds, camera),
             scale=into_all(found.state.scale, by_one.state.scale, camera),
@@ -274,15 +270,18 @@ class KeypointTracker(nn.Module):
         state, alone = state_of(stream.state, camera), torch.full_like(stream.alone, NOBODY)
         return stream._replace(state=state, alone=alone)
 
-    def _lone_tracker(self, camera: int, frame: KeypointFrame) -> "KeypointTracker":
+    def _lone_tracker(self, camera: int) -> "KeypointTracker":
         """Return what tracks by one of the cameras alone; it is set up when it is needed first."""
-        device = frame.pixels.device
-        if camera not in self._lone_trackers:
-            self._lone_trackers[camera] = KeypointTracker(
-                self._rig[0].select([camera]).to(device), self.filter.fps,
-                of_one_camera(self.filter.motion), self.filter.n_iterations, self.filter.upright,
-            )  # fmt: skip
-        return self._lone_trackers[camera].to(device)
+        rig, filter = self._rig[0], self.filter
+
+        def make() -> KeypointTracker:
+            motion, device = of_one_camera(filter.motion), rig.matrix.device
+            own = KeypointTracker(
+                rig.select([camera]), filter.fps, motion, filter.n_iterations, filter.up
+            )
+            return own.to(device)  # the network that lifts, too
+
+        return derived(self, ("alone", camera), (*rig.buffers(), *filter.motion.buffers()), make)
 
     def _seen_again(self, stream: KeypointStream, frame: KeypointFrame) -> Bool[Tensor, " B"]:
         """Return on whose bodies cameras agree that one camera had to guess."""

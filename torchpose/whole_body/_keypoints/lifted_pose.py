@@ -11,11 +11,13 @@ the lifted one.
 """
 
 import copy
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
@@ -28,6 +30,7 @@ from torchpose.whole_body._keypoints.lifting_network import (
     lifting_features,
     shipped_lifting_network,
 )
+from torchpose.whole_body._keypoints.upright import upright_of
 
 _FACTOR = (
     1.5  # on the network's standard deviations, which are those of persons that it was fitted to
@@ -44,12 +47,30 @@ _PELVIS = BODY_15.joint("pelvis")
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
 
 
+class _UprightView(NamedTuple):
+    """Holds the map from homogeneous pixels to rays [3, 3], and the pose of a camera turned upright."""
+
+    to_rays: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    @classmethod
+    def of(cls, rig: CameraRig, up: str | None) -> Self:
+        """Return the view of the only camera of a rig."""
+        upright = upright_of(rig, up)
+        assert upright is not None  # of one camera there is one
+        roll = _upright_roll(rig.rotation[0] @ upright.direction)
+        inverse = torch.linalg.inv(rig.matrix[0])
+        return cls(roll @ inverse, roll @ rig.rotation[0], roll @ rig.translation[0])
+
+
 class PoseLifter(nn.Module):
     """Lifts the keypoints of one camera to joints of a person of known size.
 
     Args:
         rig: of one camera. fps: frames per second. motion: of the person, whose legs tell the size.
-        up: [3], the direction that is up, world axes, in which the image is turned upright.
+        up: "y" or "z", the axis of the world that points up, by which the image is turned upright; without
+            it the camera is taken to be level.
         network: that lifts; the shipped one by default.
     """
 
@@ -58,20 +79,27 @@ class PoseLifter(nn.Module):
         rig: CameraRig,
         fps: float,
         motion: BodyMotion,
-        up: Float[Tensor, "3"],
+        up: str | None = None,
         network: LiftingNetwork | None = None,
     ) -> None:
         super().__init__()
         self.network = copy.deepcopy(network or shipped_lifting_network())
-        self.fps = fps
-        self.size = length_of_legs(motion) / self.network.info.legs
-        roll = _upright_roll(rig.rotation[0] @ up)
-        self.register_buffer("to_rays", roll @ torch.linalg.inv(rig.matrix[0]), persistent=False)
-        self.register_buffer("rotation", roll @ rig.rotation[0], persistent=False)
-        self.register_buffer("translation", roll @ rig.translation[0], persistent=False)
-        self.to_rays: Tensor
-        self.rotation: Tensor
-        self.translation: Tensor
+        self.fps, self.up = fps, up
+        self._given = (rig, motion)  # a tuple, so that their tensors are held once
+
+    @property
+    def size(self) -> float:
+        """Return how much larger the person is than those that the network was fitted to."""
+        motion = self._given[1]
+        legs = self.network.info.legs
+        return derived(self, "size", (motion.scale_mean,), lambda: length_of_legs(motion) / legs)
+
+    @property
+    def view(self) -> "_UprightView":
+        """Return the camera, turned upright."""
+        rig = self._given[0]
+        sources = (rig.matrix, rig.rotation, rig.translation)
+        return derived(self, "view", sources, lambda: _UprightView.of(rig, self.up))
 
     def forward(
         self, frame: KeypointFrame, memory: Float[Tensor, "B L W"] | None
@@ -87,7 +115,7 @@ class PoseLifter(nn.Module):
         lifted, memory = self.network(seen[:, None], memory)
         joints, std = (self.size * value[:, 0].to(rays) for value in lifted)
         enough = (sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS
-        return Lifted(joints @ self.rotation, torch.where(enough, std, torch.inf)), memory
+        return Lifted(joints @ self.view.rotation, torch.where(enough, std, torch.inf)), memory
 
     def placed(self, lifted: Lifted, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
         """Return lifted joints in the world, where they lie near the rays of their keypoints.
@@ -95,14 +123,15 @@ class PoseLifter(nn.Module):
         Args:
             lifted: of `forward`. frame: the keypoints.
         """
-        joints = lifted.joints @ self.rotation.mT
+        view = self.view
+        joints = lifted.joints @ view.rotation.mT
         place = place_on_rays(joints, self._rays(frame)[..., :2], frame.inlier[:, 0])
         place = torch.cat([place[:, :2], place[:, 2:].clamp_min(_NEAREST)], -1)
-        return (joints + place[:, None] - self.translation) @ self.rotation
+        return (joints + place[:, None] - view.translation) @ view.rotation
 
     def _rays(self, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
         pixels = frame.pixels[:, 0]
-        return torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) @ self.to_rays.mT
+        return torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) @ self.view.to_rays.mT
 
 
 def _upright_roll(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -117,7 +117,8 @@ class PeopleBodyTracker:
     ) -> KeypointFrame:
         """Return the detections as frames [..., D, C, J]."""
         others = (None if v is None else v.transpose(-3, -2) for v in (confidence, covariance))
-        return self.single.frames(keypoints.transpose(-4, -3), next(others), names, next(others))
+        found = self.single.frames(keypoints.transpose(-4, -3), next(others), names, next(others))
+        return found if found.inlier.shape[-3] else _with_an_empty_one(found)
 
     def _track(
         self, rows: Sequence[_Row], person: int, smoothing: bool = False, summed_up: bool = True
@@ -132,6 +133,15 @@ class PeopleBodyTracker:
         track.details["detection"] = torch.cat([one.detection for one in found])
         track.details["person"] = torch.full((len(rows),), person)
         return track
+
+
+def _with_an_empty_one(frames: KeypointFrame) -> KeypointFrame:
+    """Return frames without any detection as frames of one detection that has no keypoint."""
+    *lead, _, cameras, joints = frames.inlier.shape
+    one = frames.map(
+        lambda value: value.new_ones(*lead, 1, cameras, joints, *value.shape[len(lead) + 3 :])
+    )
+    return one._replace(inlier=torch.zeros_like(one.inlier))
 
 
 def _until_last_seen(rows: list[_Row]) -> list[_Row]:

@@ -51,6 +51,17 @@ class Upright(NamedTuple):
         return Lean(gap, self.variance * (_FREEDOM + far) / (_FREEDOM + 2), jacobian)
 
 
+def upright_of(rig: CameraRig, up: str | None) -> Upright | None:
+    """Return what is expected of leans, None of several cameras where no axis is known to point up.
+
+    Raises:
+        InputError: an axis other than "y" and "z".
+    """
+    if up is not None:
+        return known_up(rig, up)
+    return camera_up(rig) if len(rig) == 1 else None
+
+
 def camera_up(rig: CameraRig) -> Upright:
     """Return what is expected where the first camera is about level, which is all that is known."""
     direction = -rig.rotation[0, 1]
