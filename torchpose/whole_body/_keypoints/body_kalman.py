@@ -370,7 +370,7 @@ class BodyKalmanFilter(nn.Module):
         sums, count = squared_errors(readings, seen, weighed, joint_cov)
         few = (weighed.own + weighed.other).sum(-1) < _MOST * readings.inlier[0].sum(-1)
         few = few.any(-1, keepdim=True)  # which cameras are wrong is not known
-        if len(self.maps.shift) > 1 and bool(few.any()):
+        if len(self.maps.shift) > 2 and bool(few.any()):
             beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), scale)
             wide_sums, wide_count = self._by_wider(readings, seen, beliefs, joint_cov)
             sums, count = torch.where(few, wide_sums, sums), torch.where(few, wide_count, count)
