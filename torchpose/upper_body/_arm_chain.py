@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from torchpose._core.module_state import outside_inference
 from torchpose.priors._arms import ArmPrior
@@ -416,17 +416,6 @@ class ArmChain:
         far = torch.baddbmm(same, before, after.mT, alpha=-unit / (2 * scale))
         # in place: memory for as many numbers again takes longer than the arithmetic
         return far.clamp_min_(unit).square_().pow_(-2)
-
-    @staticmethod
-    def mean_directions(state: ArmState, seen: Bool[Tensor, "B 2"]) -> Float[Tensor, "B 2 2 3"]:
-        """Return the mean direction of each bone, upright axes.
-
-        Args:
-            state: the posterior. seen: whether elbow and hand are measured; if so the means have unit
-                length.
-        """
-        mean = (state.weight[..., None, :] @ state.directions)[..., 0, :].unflatten(-1, (2, 3))
-        return torch.where(seen[..., None, None], normalize(mean, dim=-1), mean)
 
 
 def _by_bone(

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchpose._core.module_state import outside_inference
-from torchpose.camera._projection import project
 from torchpose.filters._outputs import FilterOutput, first_not_finite
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
-from torchpose.upper_body._arm_chain import ArmChain, ArmState, mirrored
+from torchpose.upper_body._arm_chain import ArmState, mirrored
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
 from torchpose.upper_body._estimator import Bones, Estimates, ReadOut
 
@@ -25,6 +25,7 @@ _STD = 0.03  # metres: of every joint in space
 # full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
 # Other covariances hold as they are, with detectors' errors too.
 _WHOLE, _HAND_ALONE = 0.55, 0.75
+_ROUNDS = 3  # in which bones of given lengths are fitted to elbow and hand
 
 
 class SeenBody(NamedTuple):
@@ -60,6 +61,8 @@ class FramePose(NamedTuple):
 
     Attributes:
         joints: camera axes, metres, [B, 8, 3]. covs: [B, 8, 3, 3].
+        means, mean_covs: the posterior means of the joints, of which bones may be shorter, and the
+            covariances about these.
         turn: of the shoulders, radians, [B]. tilt: of the torso about the optical axis, [B, 3, 3].
         log_evidence: the log-evidence of both arms, [B, 2].
         log_weights: the log-weights of their hypotheses, [B, 2, N].
@@ -68,6 +71,8 @@ class FramePose(NamedTuple):
 
     joints: Tensor
     covs: Tensor
+    means: Tensor
+    mean_covs: Tensor
     turn: Tensor
     tilt: Tensor
     log_evidence: Tensor
@@ -94,10 +99,10 @@ def bones_of(
 def pose_of(
     body: SeenBody, belief: ArmState, matrix: Float[Tensor, "3 3"], calibrated: bool = True
 ) -> FramePose:
-    """Return the estimate of a frame, in camera axes: bones point along their posterior mean direction.
+    """Return the estimate of a frame, in camera axes: the pose of least expected squared error.
 
-    They keep their lengths where elbow and hand are measured. Where not, the mean is not normalised, so that
-    the joints are nearer to the shoulder: this is the estimate of least mean squared error.
+    Where elbow and hand are measured, it is that among the poses whose bones keep their lengths. Where not,
+    it is the posterior mean, whose joints are nearer to the shoulder.
 
     Args:
         body: the body but for its arms. belief: the posterior of the arms. matrix: K of the prior's camera.
@@ -106,28 +111,55 @@ def pose_of(
     """
     axes = upright_axes(body.turn)[:, None, None]
     known = body.known[:, [ELBOWS, HANDS]]
-    mean = ArmChain.mean_directions(belief, known.all(1)).flatten(2)[:, :, None]
+    mean = belief.weight[:, :, None] @ belief.directions
     shoulders = body.joints[:, SHOULDERS]
-    arms = bones_of(mean, axes, body.lengths).cumsum(-2)
+    means = bones_of(mean, axes, body.lengths).cumsum(-2)[:, :, 0]
+    both = known.all(1)[..., None, None]
+    arms = torch.where(both, _with_lengths(means, body.lengths), means)
     ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
-    off = (ends - arms).transpose(2, 3)
+    off = (ends - arms[:, :, None]).transpose(2, 3)
     spread = (belief.weight[:, :, None, :, None] * off).mT @ off
-    limbs = (shoulders[:, :, None] + arms[:, :, 0]).transpose(1, 2).flatten(1, 2)
+    limbs = (shoulders[:, :, None] + arms).transpose(1, 2).flatten(1, 2)
+    moved = (means - arms).transpose(1, 2).flatten(1, 2)
     joints = body.joints.index_copy(1, _limb_rows(limbs.device), limbs)
     covs = _covs(body, joints, spread.transpose(1, 2).flatten(1, 2))
+    trust = torch.ones_like(joints[..., 0])
     if calibrated:
-        trust = torch.ones_like(joints[..., 0])
-        both = _trust(body.known, body.exact).to(trust).repeat(1, 2)
-        covs = trust.index_copy(1, _limb_rows(covs.device), both)[..., None, None] * covs
+        of_limbs = _trust(body.known, body.exact).to(trust).repeat(1, 2)
+        trust = trust.index_copy(1, _limb_rows(covs.device), of_limbs)
+    covs = trust[..., None, None] * covs
+    apart = torch.zeros_like(joints).index_copy(1, _limb_rows(limbs.device), moved)
+    about = covs - trust[..., None, None] * apart[..., :, None] * apart[..., None, :]
     area = 2 * shoulders[..., 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
     evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]
     evidence = torch.where(known.any(1), evidence, 0.0)
     tilt = body.tilt[:, None]
     weight = belief.weight.clamp_min(1e-30).log()
     return FramePose(
-        joints @ body.tilt.mT, tilt @ covs @ tilt.mT, body.turn, body.tilt, evidence, weight,
-        body.bones.metres, body.bones.covs,
+        joints @ body.tilt.mT, tilt @ covs @ tilt.mT, (joints + apart) @ body.tilt.mT,
+        tilt @ about @ tilt.mT, body.turn, body.tilt, evidence, weight, body.bones.metres,
+        body.bones.covs,
     )  # fmt: skip
+
+
+def _with_lengths(
+    means: Float[Tensor, "B 2 2 3"], lengths: Float[Tensor, "B 4"]
+) -> Float[Tensor, "B 2 2 3"]:
+    """Return the elbows and hands nearest to given ones, by squared distances, of bones of given lengths.
+
+    Either bone is best in turn: u = L_u (m_e + m_h - f) / |m_e + m_h - f|, f = L_f (m_h - u) / |m_h - u|.
+
+    Args:
+        means: m_e and m_h, elbows and hands from the shoulders, metres. lengths: of the bones, metres.
+    """
+    elbow, hand = means.unbind(-2)
+    upper_arm, forearm = lengths[:, None, :2, None].unbind(-2)
+    upper = upper_arm * normalize(elbow, dim=-1)
+    lower = forearm * normalize(hand - upper, dim=-1)
+    for _ in range(_ROUNDS):
+        upper = upper_arm * normalize(elbow + hand - lower, dim=-1)
+        lower = forearm * normalize(hand - upper, dim=-1)
+    return torch.stack([upper, upper + lower], -2)
 
 
 @cache
@@ -189,8 +221,10 @@ def estimates_of(
     back = upright_axes(stacked.turn) @ stacked.tilt.mT
     joints = (stacked.joints - neck[:, :, None]) @ back.mT
     covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
-    uv = project(joints, matrix, back.mT, neck)[..., :2]
-    uv_covs = _pixel_covs(stacked.joints, stacked.covs, matrix)
+    # measured joints are seen where they are measured, though bones that are unsure keep their lengths
+    seen = stacked.means @ matrix.mT
+    uv = seen[..., :2] / seen[..., 2:]
+    uv_covs = _pixel_covs(stacked.means, stacked.mean_covs, matrix)
     failed_at = first_not_finite(joints.flatten(2))
     left, right = (
         FilterOutput(
