@@ -60,6 +60,7 @@ from torchpose.evaluation._trials import (
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
+from torchpose.skeleton import UPPER_BODY
 
 TRAIN_PERSONS = ("s1", "s2", "s3", "s4", "s5", "s6")
 TEST_PERSONS = ("s7", "s8")
@@ -240,8 +241,10 @@ def mean_pose(test: Trials, joints: Float[Tensor, "N 8 3"], uv: Float[Tensor, "N
     """Return the mean of the training poses for every frame; in the image, about the measured neck."""
     shape = test.truth3d.shape[:2]
     offsets = (uv - uv[:, 4:5]).mean(0)
+    neck = test.names.index("neck")
     return Estimate(
-        offsets + test.keypoints[:, :, 1:2], joints.mean(0).expand(*shape, 8, 3).contiguous()
+        offsets + test.keypoints[:, :, neck : neck + 1],
+        joints.mean(0).expand(*shape, 8, 3).contiguous(),
     )
 
 
@@ -252,13 +255,13 @@ def nearest_neighbour(
     chunk: int = 256,
     progress: bool = False,
 ) -> Estimate:
-    """Return for each frame alone the training pose whose head, neck and hands look most alike.
+    """Return for each frame alone the training pose whose measured joints look most alike.
 
     Args:
         test: sequences. joints, uv: training poses and their pixels.
         chunk: frames at a time. progress: whether to show a bar.
     """
-    columns = [3, 4, 0, 7]  # MEASURED, in UPPER_BODY
+    columns = [UPPER_BODY.index(name) for name in test.names]
     known = uv[:, columns].flatten(1).float()
     inside = test.inside
     wanted = test.keypoints[inside].flatten(1).float()

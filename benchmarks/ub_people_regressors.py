@@ -20,7 +20,7 @@ and its spread are printed.
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -47,17 +47,21 @@ from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._upper_body import mirror_pose
 
-COLUMNS = [UPPER_BODY.index(name) for name in MEASURED]
 NOISE = 3.0
 PIXELS = 100.0  # scale of the inputs
 METRES = 0.2  # scale of the targets
 
 
-def features(keypoints: Tensor) -> Tensor:
-    """Return head and hands relative to the neck, and the neck, [..., 8], scaled to about 1."""
-    neck = keypoints[..., 1:2, :]
+def features(keypoints: Tensor, names: Sequence[str]) -> Tensor:
+    """Return the other joints relative to the neck, and the neck, [..., 2 M], scaled to about 1.
+
+    Args:
+        keypoints: pixels, [..., M, 2]. names: of the M joints, a neck among them.
+    """
+    at = names.index("neck")
+    neck = keypoints[..., at : at + 1, :]
     centre = keypoints.new_tensor([319.5, 239.5])
-    rest = keypoints[..., [0, 2, 3], :] - neck
+    rest = keypoints[..., [row for row in range(len(names)) if row != at], :] - neck
     return (torch.cat([rest, neck - centre], -2) / PIXELS).flatten(-2)
 
 
@@ -67,25 +71,32 @@ def views(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     return euler_to_matrix(found.angles, "zxy").float(), found.translation.float()
 
 
-def examples(poses: Tensor, targets: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return inputs [N, T, 8] and targets [N, T, 24] of sequences [N, T, 8, 3], each from one viewpoint."""
+def examples(
+    poses: Tensor, targets: str, generator: torch.Generator, names: Sequence[str] = MEASURED
+) -> tuple[Tensor, Tensor]:
+    """Return inputs [N, T, 2 M] and targets [N, T, 24] of sequences, each from one viewpoint.
+
+    Args:
+        poses: sequences, [N, T, 8, 3]. targets: axes of the poses that are learnt, "body" or "camera".
+        generator: of views and noise. names: of the M measured joints.
+    """
     flip = torch.rand(len(poses), generator=generator) < 0.5
     poses = torch.where(flip[:, None, None, None], mirror_pose(poses), poses)
     rotation, translation = views(len(poses), generator)
     rotation, translation = rotation[:, None], translation[:, None]
     uv = project(poses, CAMERA.matrix.float(), rotation, translation)[..., :2]
-    keypoints = uv[..., COLUMNS, :]
+    keypoints = uv[..., [UPPER_BODY.index(name) for name in names], :]
     keypoints = keypoints + NOISE * torch.randn(keypoints.shape, generator=generator)
     wanted = poses if targets == "body" else poses @ rotation.mT
-    return features(keypoints), (wanted / METRES).flatten(-2)
+    return features(keypoints, names), (wanted / METRES).flatten(-2)
 
 
 class Recurrent(nn.Module):
     """Two layers of 128 gated units, in one direction or both."""
 
-    def __init__(self, both: bool) -> None:
+    def __init__(self, n_inputs: int, both: bool) -> None:
         super().__init__()
-        self.cells = nn.GRU(8, 128, 2, batch_first=True, bidirectional=both)
+        self.cells = nn.GRU(n_inputs, 128, 2, batch_first=True, bidirectional=both)
         self.out = nn.Linear(256 if both else 128, 24)
 
     def forward(self, x: Tensor, lengths: Tensor | None = None) -> Tensor:
@@ -99,45 +110,52 @@ class Recurrent(nn.Module):
         return self.out(hidden)
 
 
-def multilayer() -> nn.Module:
+def multilayer(n_inputs: int) -> nn.Module:
     return nn.Sequential(
-        nn.Linear(8, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 24)
+        nn.Linear(n_inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 24)
     )
 
 
-def train_frames(poses: list[Tensor], targets: str, seed: int, quick: bool) -> nn.Module:
+def train_frames(
+    poses: list[Tensor], targets: str, seed: int, quick: bool, names: Sequence[str] = MEASURED
+) -> nn.Module:
     """Train the per-frame MLP on 100,000 projected poses."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     frames = torch.cat(poses)
     n, epochs = (5_000, 5) if quick else (100_000, 40)
     chosen = frames[torch.randint(len(frames), (n,), generator=generator)]
-    x, y = examples(chosen[:, None], targets, generator)
+    x, y = examples(chosen[:, None], targets, generator, names)
     x, y = x[:, 0], y[:, 0]
     batches = [
         part for _ in range(epochs) for part in torch.randperm(n, generator=generator).split(512)
     ]
-    model = multilayer()
+    model = multilayer(x.shape[-1])
     fit(model, lambda step: (x[batches[step]], y[batches[step]]), len(batches), "MLP")
     return model
 
 
 def train_sequences(
-    poses: list[Tensor], targets: str, seed: int, quick: bool, both: bool
+    poses: list[Tensor],
+    targets: str,
+    seed: int,
+    quick: bool,
+    both: bool,
+    names: Sequence[str] = MEASURED,
 ) -> nn.Module:
     """Train a GRU on random pieces of 64 frames of the training sequences."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     lengths = torch.tensor([len(p) for p in poses])
     stacked = torch.nn.utils.rnn.pad_sequence(poses, True)
-    model = Recurrent(both)
+    model = Recurrent(2 * len(names), both)
 
     def batch(step: int) -> tuple[Tensor, Tensor]:
         row = torch.multinomial(lengths.double(), 32, True, generator=generator)
         first = torch.rand(32, generator=generator) * (lengths[row] - 64).clamp_min(0)
         # a sequence that is too short stands still at its end
         place = torch.minimum(first.long()[:, None] + torch.arange(64), lengths[row][:, None] - 1)
-        return examples(stacked[row[:, None], place], targets, generator)
+        return examples(stacked[row[:, None], place], targets, generator, names)
 
     fit(model, batch, 40 if quick else 1_500, "GRU, both directions" if both else "GRU")
     return model
@@ -162,7 +180,7 @@ def fit(
 def estimate(model: nn.Module, test: Trials) -> Estimate:
     """Return the poses of a test set; pixels are NaN, since the regressors give none."""
     with torch.inference_mode():
-        inputs = features(test.keypoints).nan_to_num().float()
+        inputs = features(test.keypoints, test.names).nan_to_num().float()
         found = model(inputs, test.lengths) if isinstance(model, Recurrent) else model(inputs)
     joints = METRES * found.unflatten(-1, (8, 3)).double()
     return Estimate(torch.full_like(test.truth2d, torch.nan), joints)

@@ -8,11 +8,13 @@ others in the same place, and from nobody in the place of the other Kinect. In t
 Pose2Sim a person is seen by four real cameras: every one is predicted from the others.
 
     python -m benchmarks.keypoint_bodies --data DIR [--out FILE] [--methods NAME ...] [--lifters FILE]
+    python -m benchmarks.keypoint_bodies --data DIR --noise-alone --methods kalman kalman-smoothed pose2sim
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
-The second line prints what the constants of the filters of single joints were chosen by. The third fits the
-network that comes with torchpose and lifts the keypoints of one camera.
+The second line shows what noise costs by itself, in several cameras. The third prints what the constants
+of the filters of single joints were chosen by. The fourth fits the network that comes with torchpose and
+lifts the keypoints of one camera.
 """
 
 from __future__ import annotations
@@ -28,8 +30,10 @@ from benchmarks._table_file import TableFile, save_text
 from benchmarks.keypoint_bodies.choosing import add_choices
 from benchmarks.keypoint_bodies.clips import (
     CHOOSING,
+    FAULTS,
     KINECT,
     KINECT_SCORED,
+    NOISE_ALONE,
     OTHER_KINECT,
     RIGS,
     SCORED,
@@ -55,6 +59,7 @@ def main(
     lifters: Path | None = None,
     threads: int = 2,
     out: TableFile | None = None,
+    noise_alone: bool = False,
     choose: bool = False,
     fit: Path | None = None,
     quick: bool = False,
@@ -67,6 +72,7 @@ def main(
         lifters: file for the weights of the learned lifters, read if it is there, else written.
         threads: cores.
         out: file for the same as Markdown, or a folder.
+        noise_alone: whether keypoints have noise and nothing else, in several cameras only.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
@@ -79,11 +85,14 @@ def main(
     names = CHOOSING if choose else SCORED
     if quick:
         names = {folder: chosen[:1] for folder, chosen in names.items()}
-    clips = read_clips(data, names)
+    clips = read_clips(data, names, faults=NOISE_ALONE if noise_alone else FAULTS)
     if quick:
         clips = {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
     if choose:
         add_choices(report, clips)
+    elif noise_alone:
+        for cameras in (count for count in RIGS if count > 1):
+            add_table(report, methods_of(methods, data, lifters, quick), clips, cameras)
     else:
         chosen = methods_of(methods, data, lifters, quick)
         for cameras in RIGS:

@@ -109,6 +109,7 @@ class Faults(NamedTuple):
 
 
 FAULTS = Faults()
+NOISE_ALONE = Faults(missing=0.0, outliers=0.0, exchanged=0.0)
 CLEAN = Faults(noise=0.0, missing=0.0, outliers=0.0, exchanged=0.0)
 
 
