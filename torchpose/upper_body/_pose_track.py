@@ -59,7 +59,8 @@ class PoseTrack:
     Past the length of a sequence its last pose is repeated.
 
     Attributes:
-        joints2d: [B, T, 8, 2], the joints in the image, pixels of the input's camera.
+        joints2d: [B, T, 8, 2], the joints in the image, pixels of the input's camera. They are expected
+            there; where bones of constant length do not reach, `joints3d` project elsewhere.
         joints3d: [B, T, 8, 3], the joints in space, metres, in the axes of `frame`.
         covariance2d: [B, T, 8, 2, 2], their covariances, pixels squared.
         covariance3d: [B, T, 8, 3, 3], their covariances, metres squared.
