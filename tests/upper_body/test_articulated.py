@@ -18,6 +18,7 @@ from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_poses import _trust
 from torchpose.upper_body._estimator import TrackerModel
+from torchpose.upper_body._root_grid import RootGrid
 from torchpose.upper_body._torso_likelihood import half_widths
 
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
@@ -117,6 +118,25 @@ def test_a_first_hand_that_is_an_outlier_does_not_bring_a_body_near():
     seen[0, 0, ROW["hand_left"]] = seen[0, 0, ROW["neck"]] - torch.tensor([90.0, 70.0])
     found = tracker(outliers=False)(seen).joints3d[0]
     assert float(found[-1, ROW["neck"], 2]) > 0.75 * 2.7
+
+
+def test_depths_are_looked_through_only_where_arms_are_first_seen(monkeypatch):
+    """It doubles the work of an update, and nothing is ruled out while no arm is seen."""
+    looked, frame = [], 0
+    whole = RootGrid.at_all_depths
+
+    def look(*given):
+        looked.append(frame)
+        return whole(*given)
+
+    monkeypatch.setattr(RootGrid, "at_all_depths", look)
+    seen = pixels(body(12))
+    seen[:6, [row for name, row in ROW.items() if "elbow" in name or "hand" in name]] = torch.nan
+    live = tracker(outliers=False)
+    state = live.init(1)
+    for frame, keypoints in enumerate(seen):  # noqa: B007  # `look` reads it
+        state, _ = live.step(state, keypoints[None])
+    assert looked == [6]
 
 
 def test_scale_and_depth_are_one():

@@ -286,8 +286,8 @@ class ArticulatedFilter(Estimator):
             fresh = None
             if waiting is not None:
                 there = frame.limbs.flatten(1).any(1) & (frame.torso.sum(1) > 1)
-                fresh, waiting = waiting & there, _some(waiting & ~there)
-                power = power.masked_fill(fresh, 1.0)
+                fresh, waiting = _some(waiting & there), _some(waiting & ~there)
+                power = power if fresh is None else power.masked_fill(fresh, 1.0)
             belief, roots = self.root.weigh(belief, tilted, last, sizes, power, fresh)
         root = roots.mean
         middle = self.root.middle(tilted.torso, root, last, sizes)

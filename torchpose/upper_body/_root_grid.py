@@ -19,10 +19,8 @@ _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
 _EVERY = 4  # steps of log depth between the depths of `RootGrid.at_all_depths`
-_TOLERATED, _RULING = (
-    8.0,
-    0.2,
-)  # nats by which arms fit worse than best, and the weight of what is beyond
+_TOLERATED = 8.0  # nats by which arms may fit worse than at the best depth
+_RULING = 0.2  # weight of what is beyond that
 _MOST_SAID = 0.1  # nats of extrapolated evidence
 _MOST = 500.0  # nats by which a cell may gain, which has next to no belief then
 _LOST = 1e-6  # share of a frame's belief that restarts from the prior
