@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpose.camera import CameraRig, PinholeCamera, save_cameras
 from torchpose.camera._rig import as_rig, undistortion_maps
@@ -152,6 +153,22 @@ def test_maps_take_any_number_of_distortions(distortions):
     K = camera.matrix.numpy()
     wanted = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, (64, 48), cv2.CV_32FC1)
     np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+def test_cameras_without_distortion_take_one_reading_of_values():
+    """Each waits for a GPU, in every live step."""
+
+    class Count(TorchDispatchMode):
+        readings = 0
+
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            self.readings += function is torch.ops.aten._local_scalar_dense.default
+            return function(*args, **(kwargs or {}))
+
+    rig, points = CameraRig(make_cameras()), torch.zeros(3, 5, 2, dtype=torch.float64)
+    with Count() as count:
+        assert rig.undistort_points(points) is points
+    assert count.readings == 1
 
 
 def test_undistort_points_has_nothing_where_no_ray_ends():

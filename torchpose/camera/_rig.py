@@ -221,7 +221,7 @@ class CameraRig(nn.Module):
                 f"points must be of {len(self)} cameras ({', '.join(self.names)}), got "
                 f"{points.shape[-3]}"
             )
-        if not any(map(is_distorted, self.distortions, self.fisheye)):
+        if not is_distorted(self.distortions, any(self.fisheye)):
             return points
         straight = points.clone()
         for c in range(len(self)):
@@ -294,8 +294,13 @@ class CameraRig(nn.Module):
         return out > 127 if mask else out
 
 
-def is_distorted(distortions: Float[Tensor, " n"], fisheye: bool) -> bool:
-    """Return whether a lens changes anything; that of the fisheye model does without a coefficient too."""
+def is_distorted(distortions: Float[Tensor, "*cameras n"], fisheye: bool) -> bool:
+    """Return whether a lens, or one of several, changes anything.
+
+    Args:
+        distortions: of the lens, or of all.
+        fisheye: whether one is of the fisheye model, which changes rays without a coefficient too.
+    """
     return fisheye or bool(distortions.any())
 
 

@@ -50,6 +50,9 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.upright import Upright, upright_of
 
+FEW_INLIERS = 0.7
+"""Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
+
 _JITTER = (
     1e-9  # share of a joint's information that is added along every axis, so that it has a factor
 )
@@ -61,8 +64,7 @@ _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
 _SCALE_TIME = 2.0  # seconds over which they are estimated
-_MOST = 0.7  # share of a camera's keypoints below which its noise may be wider
-_WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of it that are tried
+_WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of the noise that are tried for cameras with few inliers
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
 
 
@@ -368,12 +370,16 @@ class BodyKalmanFilter(nn.Module):
     ) -> Float[Tensor, "B C"]:
         """Return the factors of the cameras' noise, averaged over the last seconds."""
         sums, count = squared_errors(readings, seen, weighed, joint_cov)
-        few = (weighed.own + weighed.other).sum(-1) < _MOST * readings.inlier[0].sum(-1)
-        few = few.any(-1, keepdim=True)  # which cameras are wrong is not known
-        if len(self.maps.shift) > 2 and bool(few.any()):
-            beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), scale)
-            wide_sums, wide_count = self._by_wider(readings, seen, beliefs, joint_cov)
-            sums, count = torch.where(few, wide_sums, sums), torch.where(few, wide_count, count)
+        if len(self.maps.shift) > 2:  # of two cameras nothing tells which is wrong
+            least = FEW_INLIERS * readings.inlier[0].sum(-1)
+            few = ((weighed.own + weighed.other).sum(-1) < least).any(-1, keepdim=True)
+            if bool(few.any()):
+                beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), scale)
+                wider = self._by_wider(readings, seen, beliefs, joint_cov)
+                sums, count = (
+                    torch.where(few, wide, own)
+                    for wide, own in zip(wider, (sums, count), strict=True)
+                )
         share = (count / _SCALE_COUNT).clamp_max(1) / (_SCALE_TIME * self.fps)
         ratio = sums / count.clamp_min(1e-6)
         return (scale * (1 + share * (ratio - 1))).clamp(*NOISE_SCALES)

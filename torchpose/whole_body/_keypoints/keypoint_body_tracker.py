@@ -360,11 +360,11 @@ class KeypointBodyTracker(nn.Module):
         refined: RefinedCameras | None,
         first_frame: int,
     ) -> tuple[str, ...]:
-        notes = notes_of(
-            self.rig.names, frame.inlier > 0, poses.inlier, poses.exchanged, poses.coasting,
-            poses.alone, self.sized, first_frame,
-        )  # fmt: skip
         there = frame.inlier > 0
+        notes = notes_of(
+            self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
+            self.sized, first_frame,
+        )  # fmt: skip
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
         if len(self.rig) == 1 or not cameras:
             return notes

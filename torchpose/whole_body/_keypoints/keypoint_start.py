@@ -17,6 +17,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
+    FEW_INLIERS,
     BodyGaussian,
     BodyKalmanFilter,
     CorrectedBody,
@@ -41,7 +42,6 @@ _WIDTHS = (
     1.0,
 )  # factors of the noise's variance
 _WIDER = 16.0  # factor of the variance of cameras whose calibration may be wrong
-_FEW = 0.7  # share of the keypoints of a start below which they are
 _WIDTHS_OF_ONE = _WIDTHS[-5:]
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
@@ -75,7 +75,7 @@ def _by_wider(
     """
     share = (found.weighed.own + found.weighed.other).sum((-2, -1)) / frame.inlier.sum((-2, -1))
     several = (frame.inlier > 0).any(-1).sum(-1) > 2
-    rows = ((share < _FEW) & several).nonzero().squeeze(-1)
+    rows = ((share < FEW_INLIERS) & several).nonzero().squeeze(-1)
     if not len(rows):
         return found
     state = state.take(rows)

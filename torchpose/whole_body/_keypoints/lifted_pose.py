@@ -30,7 +30,7 @@ from torchpose.whole_body._keypoints.lifting_network import (
     lifting_features,
     shipped_lifting_network,
 )
-from torchpose.whole_body._keypoints.upright import upright_of
+from torchpose.whole_body._keypoints.upright import camera_up, upright_of
 
 _FACTOR = (
     1.5  # on the network's standard deviations, which are those of persons that it was fitted to
@@ -57,8 +57,7 @@ class _UprightView(NamedTuple):
     @classmethod
     def of(cls, rig: CameraRig, up: str | None) -> Self:
         """Return the view of the only camera of a rig."""
-        upright = upright_of(rig, up)
-        assert upright is not None  # of one camera there is one
+        upright = upright_of(rig, up) or camera_up(rig)
         roll = _upright_roll(rig.rotation[0] @ upright.direction)
         inverse = torch.linalg.inv(rig.matrix[0])
         return cls(roll @ inverse, roll @ rig.rotation[0], roll @ rig.translation[0])
