@@ -40,9 +40,8 @@ _BODY = {
 }
 _FPS = 30.0  # of files that need a rate, where none is known
 _APART = 1e-3  # metres between joints and where the states put them
-_APART_OF = {
-    "kalman": 5.0
-}  # whose bones adapt over time, by metres where keypoints are no person's
+# Bones of this method adapt over time, by metres where keypoints are no person's.
+_APART_OF = {"kalman": 5.0}
 _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no person is outside
 
 
