@@ -235,6 +235,15 @@ def test_cameras_in_other_units_are_refused_with_their_factor(factor):
     assert found == pytest.approx(factor, rel=0.15)
 
 
+@pytest.mark.parametrize("method", ["sir", "kalman"])
+def test_cameras_in_feet_are_refused_by_particles_and_for_several_persons(method):
+    given = scene(3, 20)
+    tracker = BodyTracker(scaled(given.rig, 3.28), method, fps=FPS)
+    several = {"persons": "all", "keypoints": given.keypoints[:, :, None]}
+    with pytest.raises(CameraError, match="in metres, and as they are given"):
+        tracker(**(several if method == "kalman" else {"keypoints": given.keypoints}))
+
+
 @pytest.mark.parametrize(
     "height, distance, apart", [(0.65, 4.0, 1.5), (2.15, 4.0, 1.5), (1.7, 4.0, 0.01)]
 )

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import CameraError
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
 
@@ -20,14 +21,15 @@ _AGREED = 0.5  # share of the joints that two cameras see, on which they have to
 _SHORTEST, _LONGEST = 0.15, 2.0  # of bones, by those that are expected; infants have 0.3
 
 
-def check_units(maps: RigMaps, frames: KeypointFrame, motion: BodyMotion) -> None:
+def check_units(filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
     """Raise `CameraError` where people are many times as large as a person, or as small.
 
     Args:
-        maps: of the cameras. frames: keypoints [B, T, C, J]. motion: of the person, whose bones are expected.
+        filter: of the cameras, and of the person whose bones are expected. frames: keypoints [B, T, C, J].
     """
     stride = max(1, frames.pixels.shape[1] // _FRAMES)
-    logs = _log_factors(maps, frames.map(lambda value: value[:, ::stride].flatten(0, 1)), motion)
+    some = frames.map(lambda value: value[:, ::stride].flatten(0, 1))
+    logs = _log_factors(filter.maps, some, filter.motion)
     if len(logs) < _LEAST_BONES:
         return
     factor = math.exp(float(logs.median()))

@@ -145,7 +145,7 @@ class KeypointBodyTracker(nn.Module):
         single = keypoints.ndim == 4
         if single:
             frames = frames.map(lambda value: value[None])
-        check_units(self.tracker.filter.maps, frames, self.tracker.filter.motion)
+        check_units(self.tracker.filter, frames)
         begun = self.first_frames(frames)
         if refine != "none":
             frames = frames.map(lambda value: value[:, begun[0] :])

@@ -12,6 +12,7 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_body_tracker import SMOOTHING, KeypointBodyTracker
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import (
@@ -83,6 +84,7 @@ class PeopleBodyTracker:
         persons = [_until_last_seen(of_one) for of_one in rows.values()]
         identities = [int(one[-1].frame.identity[one[-1].row]) for one in persons]
         named = sorted((who, i) for i, who in enumerate(identities) if who > 0)
+        self._check_units([row for _, i in named for row in persons[i]])
         return [self._track(persons[i], who, smoothing == "full") for who, i in named]
 
     @torch.no_grad()
@@ -119,6 +121,12 @@ class PeopleBodyTracker:
         others = (None if v is None else v.transpose(-3, -2) for v in (confidence, covariance))
         found = self.single.frames(keypoints.transpose(-4, -3), next(others), names, next(others))
         return found if found.inlier.shape[-3] else _with_an_empty_one(found)
+
+    def _check_units(self, rows: Sequence[_Row]) -> None:
+        """Raise `CameraError` where cameras are not in metres, by the bones of all persons together."""
+        if rows:
+            seen = [taken(one.frame.keypoints, torch.tensor([one.row])) for one in rows]
+            check_units(self.single.tracker.filter, stacked(seen))
 
     def _track(
         self, rows: Sequence[_Row], person: int, smoothing: bool = False, summed_up: bool = True
