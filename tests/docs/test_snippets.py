@@ -84,6 +84,15 @@ def test_code_on_the_pages_comes_from_files():
     assert used == names
 
 
+def test_what_pages_include_is_there():
+    bases = (ROOT / "docs", ROOT / "torchpose" / "weights")
+    for page in PAGES:
+        for name in re.findall(
+            r'^--8<-- "([^":]+)', page.read_text(encoding="utf-8"), re.MULTILINE
+        ):
+            assert any((base / name).is_file() for base in bases), f"{page}: {name} is missing"
+
+
 def test_readme_shows_a_snippet():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
