@@ -124,6 +124,31 @@ def test_curves_show_the_band_and_the_gap(scene) -> None:
     assert not figure.axes[3].patches
 
 
+def test_times_are_those_of_the_recording(scene) -> None:
+    curves = viz.plot_joint_curves(scene.joints, None, scene.observed, first_frame=60)
+    first = curves.axes[0]
+    assert first.get_lines()[0].get_xdata()[[0, -1]] == pytest.approx([2.0, (60 + 119) / 30])
+    hand = curves.axes[6]
+    gap = hand.patches[0].get_extents().transformed(hand.transData.inverted())
+    assert (gap.x0, gap.x1) == pytest.approx((2 + 29.5 / 30, 2 + 59.5 / 30))
+    strip = viz.plot_pose_strip(scene.joints, n_frames=2, first_frame=60)
+    assert [ax.get_title() for ax in strip.axes if ax.get_title()] == ["2.0 s", "6.0 s"]
+
+
+def test_inferred_joints_of_a_body_are_hollow() -> None:
+    joints = torch.randn(2, 15, 3, generator=torch.Generator().manual_seed(0))
+    observed = torch.ones(2, 15).bool()
+    observed[1, 3] = False
+    figure = plot_body_strip(joints, observed=observed)
+    white = [(ax.collections[0].get_facecolor()[:, :3] == 1).all(-1).nonzero()[0].tolist()
+             for ax in figure.axes]  # fmt: skip
+    assert white == [[], [3], [], [3]]
+    assert [text.get_text() for text in figure.legends[0].get_texts()][2:] == [
+        "measured",
+        "inferred",
+    ]
+
+
 def test_spans_of_a_flag() -> None:
     flag = torch.tensor([1, 1, 0, 0, 1, 0, 1]).bool()
     assert _spans(flag) == [(-0.5, 1.5), (3.5, 4.5), (5.5, 6.5)]

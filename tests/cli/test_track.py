@@ -108,6 +108,18 @@ def test_pictures(torchpose, files, tmp_path):
     }  # fmt: skip
 
 
+def test_pictures_have_the_times_of_the_recording(files):
+    pytest.importorskip("matplotlib")
+    from torchpose.cli._track_output import track_pictures
+
+    late = replace(expected(files), first_frame=45)
+    figures = {name: draw() for name, draw in track_pictures(late).items()}
+    second = 45 / late.fps
+    titles = [ax.get_title() for ax in figures["pose_strip.png"].axes]
+    assert titles[0] == f"{second:.1f} s"
+    assert figures["joint_curves.png"].axes[0].get_lines()[0].get_xdata()[0] == second
+
+
 def test_without_matplotlib_it_says_how_to_get_pictures(torchpose, files, tmp_path, monkeypatch):
     monkeypatch.setattr("torchpose.cli._common.find_spec", lambda name: None)
     prior = files / "prior.safetensors"

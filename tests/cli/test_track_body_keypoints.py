@@ -268,6 +268,22 @@ def load_camera(scene):
     return load_cameras(scene[0] / "cameras.toml")["left"]
 
 
+def test_a_page_that_begins_late_says_so(track, scene, tmp_path):
+    given = []
+    for camera in (0, 2):
+        points = scene[2][:, camera].clone()
+        points[:3] = torch.nan
+        given.append(tmp_path / f"{camera}.npz")
+        write_keypoints(given[-1], keypoints_of(points))
+    words = ("--camera-names", "front,behind", *PLAIN)
+    assert track(tmp_path / "out", *given, *words).code == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<li>frame 0 of this page is frame 3 of the recording</li>" in page
+    assert (tmp_path / "out" / "joints.csv").read_text().splitlines()[1].startswith("3,")
+    assert track(tmp_path / "on-time", "front_json", "left.csv", "behind.npz", *PLAIN).code == 0
+    assert "of this page is" not in (tmp_path / "on-time" / "report.html").read_text()
+
+
 def test_delays_bring_cameras_in_step(track, scene, tmp_path):
     points = scene[2]
     late = torch.cat([points[:1, 1].expand(3, -1, -1), points[:, 1]])

@@ -188,6 +188,7 @@ def test_long_tracks_are_thinned_without_losing_a_peak(tmp_path, monkeypatch):
             np.nanmax((joints + half)[rows, 2], 0), abs=1e-4
         )
     assert sum("Thinned for this page" in text for text in found.texts) == 2
+    assert not any("poses.npz" in text for text in found.texts)  # that of bodies is body.npz
     assert any("every 5th pose" in text and "every 11 frames" not in text for text in found.texts)
 
 

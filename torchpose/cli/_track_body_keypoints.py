@@ -305,10 +305,11 @@ def _write_skeleton(path: "Path", poses: "BodyTrack", camera: "PinholeCamera") -
     from torchpose.viz._body_picture import plot_body_strip
     from torchpose.viz._style import save_figure
 
-    seen = poses.seen_by(camera).joints3d[0]
+    seen = poses.seen_by(camera)
     figure = plot_body_strip(
-        seen, poses.body.skeleton, fps=poses.fps or 30.0, first_frame=poses.first_frame
-    )
+        seen.joints3d[0], poses.body.skeleton, fps=poses.fps or 30.0,
+        first_frame=poses.first_frame, observed=seen.observed[0],
+    )  # fmt: skip
     return save_figure(figure, path)
 
 

@@ -256,11 +256,12 @@ def write_page(
     overlay = out / _overlay_name(camera.name)
     bones = [(p, j) for j, p in enumerate(people[0].body.skeleton.parents) if p >= 0]
     first, end = _span(people)
+    late = [f"frame 0 of this page is frame {first} of the recording"] if first else []
     page = write_report(
         out / "report.html", [poses.seen_by(camera) for poses in people],
         overlay=overlay if overlay.exists() else None,
         title="Tracked body" if len(people) == 1 else "Tracked bodies", facts=facts,
-        notes=_notes_of(people), first_frames=[poses.first_frame - first for poses in people],
+        notes=[*late, *_notes_of(people)], first_frames=[poses.first_frame - first for poses in people],
         n_frames=end - first, limbs=bones,
     )  # fmt: skip
     return [page]

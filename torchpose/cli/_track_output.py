@@ -92,14 +92,16 @@ def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) ->
     """Return the pictures of one sequence by file name, each as a function that draws it."""
     from torchpose import viz
 
-    joints, observed, fps = track.joints3d[0], track.observed[0], track.fps or 30.0
+    joints, observed = track.joints3d[0], track.observed[0]
+    fps, first = track.fps or 30.0, track.first_frame
     return {
         "pose_strip.png": lambda: viz.plot_pose_strip(
-            joints, fps=fps, observed=observed, truth=truth, labels=labels, title="Tracked poses"
+            joints, fps=fps, observed=observed, truth=truth, labels=labels, title="Tracked poses",
+            first_frame=first,
         ),
         "joint_curves.png": lambda: viz.plot_joint_curves(
             joints, track.covariance3d[0], observed, truth, fps=fps,
-            title="Hands and elbows with 90 % bands",
+            title="Hands and elbows with 90 % bands", first_frame=first,
         ),
     }  # fmt: skip
 

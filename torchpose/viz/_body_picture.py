@@ -5,12 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.body._skeleton import BODY_15, BodySkeleton
-from torchpose.viz._skeletons import _choose_frames, _limits, _set_view, draw_skeleton
+from torchpose.viz._skeletons import (
+    _choose_frames,
+    _limits,
+    _set_view,
+    draw_skeleton,
+    measured_entries,
+)
 from torchpose.viz._style import (
     INK,
     LEFT,
@@ -38,6 +44,7 @@ def plot_body_strip(
     n_frames: int = 6,
     fps: float = 30.0,
     first_frame: int = 0,
+    observed: Bool[Tensor, "T J"] | None = None,
 ) -> Figure:
     """Return some frames of a body at one scale, as a camera sees it and from the side.
 
@@ -46,7 +53,7 @@ def plot_body_strip(
     Args:
         joints: camera axes, metres. skeleton: whose joints they are.
         n_frames: number of frames to draw, spread over all. fps: frames per second, for the times above.
-        first_frame: number of the first frame.
+        first_frame: number of the first frame. observed: True = measured; the other joints are hollow.
 
     Raises:
         ShapeError: joints of another shape. InputError: no frame.
@@ -68,17 +75,17 @@ def plot_body_strip(
             ax = grid[row, column]
             ax.set_axis_off()
             draw_skeleton(
-                ax, centred[frame][:, pick], colors=joint_colors(skeleton.names), limbs=limbs,
-                linewidth=2.2,
+                ax, centred[frame][:, pick], observed=None if observed is None else observed[frame],
+                colors=joint_colors(skeleton.names), limbs=limbs, linewidth=2.2,
             )  # fmt: skip
             _set_view(ax, low, high, pick)
             if column == 0:
                 label_row(ax, name)
         title = f"{(frame + first_frame) / fps:.1f} s"
         grid[0, column].set_title(title, fontsize=SMALL, color=INK)
-    add_legend(
-        figure,
-        [legend_line(f"person's {side}", color, linewidth=3)
-         for side, color in (("left", LEFT), ("right", RIGHT))],
-    )  # fmt: skip
+    entries = [
+        legend_line(f"person's {side}", color, linewidth=3)
+        for side, color in (("left", LEFT), ("right", RIGHT))
+    ]
+    add_legend(figure, entries + ([] if observed is None else measured_entries()))
     return figure

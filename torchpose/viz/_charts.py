@@ -54,6 +54,7 @@ def plot_joint_curves(
     show: Sequence[str] = CURVE_JOINTS,
     level: float = 0.9,
     title: str | None = None,
+    first_frame: int = 0,
 ) -> Figure:
     """Return coordinates of some joints over time, with bands, and with gaps of the measurements.
 
@@ -65,6 +66,7 @@ def plot_joint_curves(
         truth: [T, 8, D], drawn in dark grey.
         fps: frames per second. show: names of the joints, one row each.
         level: probability of the bands. title: above the picture.
+        first_frame: number of the first pose's frame in the recording, whose times are shown.
 
     Returns:
         matplotlib `Figure`, a row for each joint and a column for each coordinate.
@@ -83,7 +85,7 @@ def plot_joint_curves(
     )
     figure = new_figure(4.0 * dims, 1.65 * len(rows) + 0.9, title)
     grid = figure.subplots(len(rows), dims, sharex=True, squeeze=False)
-    time = torch.arange(joints.shape[0]).numpy() / fps
+    time = (first_frame + torch.arange(joints.shape[0]).numpy()) / fps
     half = float(chi2_quantile(torch.tensor(level, dtype=torch.float64), 1).sqrt())
     colors = joint_colors(UPPER_BODY)
     for row, joint in enumerate(rows):
@@ -95,7 +97,8 @@ def plot_joint_curves(
             middle = to_numpy(joints[:, joint, d])
             if observed is not None and not never:
                 for start, stop in _spans(~observed[:, joint]):
-                    ax.axvspan(start / fps, stop / fps, color=_GAP, linewidth=0, zorder=0)
+                    ends = ((first_frame + start) / fps, (first_frame + stop) / fps)
+                    ax.axvspan(*ends, color=_GAP, linewidth=0, zorder=0)
             if covariance is not None:
                 spread = half * to_numpy(covariance[:, joint, d, d]) ** 0.5
                 ax.fill_between(

@@ -132,16 +132,21 @@ def _legend_entries(
         legend_line("person's right arm", RIGHT, linewidth=3),
     ]
     if observed is not None:
-        for name, face in (("measured", MIDDLE), ("inferred", "white")):
-            entries.append(
-                legend_line(name, MIDDLE, marker="o", linestyle="", markerfacecolor=face)
-            )
+        entries += measured_entries()
     if covariance is not None:
         label = f"{100 * level:.0f} % ellipse"
         entries.append(Patch(facecolor="#DDDDDD", edgecolor=MUTED, label=label))
     if truth is not None:
         entries.append(legend_line("truth", PALE, linewidth=2.5))
     return entries
+
+
+def measured_entries() -> list[Any]:
+    """Return what a legend says of filled and of hollow joints."""
+    return [
+        legend_line(name, MIDDLE, marker="o", linestyle="", markerfacecolor=face)
+        for name, face in (("measured", MIDDLE), ("inferred", "white"))
+    ]
 
 
 def _draw_truth(ax: Axes, joints: Tensor, linewidth: float = 2.0) -> None:
@@ -264,6 +269,7 @@ def plot_pose_strip(
     truth: Float[Tensor, "T 8 D"] | None = None,
     labels: Sequence[str] | None = None,
     title: str | None = None,
+    first_frame: int = 0,
 ) -> Figure:
     """Return a strip of frames, at one scale; 3D poses get a second row, seen from the side.
 
@@ -275,6 +281,7 @@ def plot_pose_strip(
         fps: frames per second, for the times below the panels.
         observed: [T, 8], True = measured. truth: [T, 8, D], drawn in grey.
         labels: [T], a word for each frame. title: above the picture.
+        first_frame: number of the first pose's frame in the recording, whose times are shown.
 
     Returns:
         matplotlib `Figure`.
@@ -313,7 +320,7 @@ def plot_pose_strip(
                 label_row(ax, ("front", "side")[row])
         word = f"\n{labels[frame]}" if labels is not None else ""
         top = grid[line * len(views), column]
-        top.set_title(f"{frame / fps:.1f} s{word}", fontsize=SMALL, color=INK)
+        top.set_title(f"{(frame + first_frame) / fps:.1f} s{word}", fontsize=SMALL, color=INK)
     add_legend(figure, _legend_entries(observed, None, truth, 0.9))
     return figure
 

@@ -184,6 +184,21 @@ def test_a_person_who_went_away_is_found_elsewhere(four):
 
 
 @pytest.mark.parametrize("smoothing", ["none", "full"])
+def test_who_was_away_for_a_second_and_turned_is_right_at_once(smoothing):
+    given = scene(2, 56)
+    c, s = math.cos(2.6), math.sin(2.6)
+    turn = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float64)
+    joints = given.joints.clone()
+    joints[46:] = joints[46:] @ turn.mT + torch.tensor([0.6, 0.0, -0.4])
+    keypoints = given.rig(joints).pixels
+    keypoints[15:46] = torch.nan
+    found = track(given._replace(keypoints=keypoints), smoothing)
+    assert found.coasting.nonzero().flatten().tolist() == list(range(15, 46))
+    assert found.respread.nonzero().flatten().tolist() == [46]
+    assert float(errors(found, joints)[46:].mean(-1).max()) < 0.03
+
+
+@pytest.mark.parametrize("smoothing", ["none", "full"])
 def test_who_comes_late_has_no_earlier_pose(smoothing):
     """The pose, body and all are those of the same keypoints without the empty frames before."""
     small = scene(3, 12, height=0.9)

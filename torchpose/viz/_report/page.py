@@ -208,7 +208,7 @@ def _thinning_notes(thinned: Sequence[Thinned], fps: float) -> list[str]:
         notes.append(
             f"Thinned for this page: curves of more than {CURVE_POINTS:,} frames show the lowest and "
             f"the highest value of every {bucket} frames, and the widest band. All values are in "
-            "poses.npz."
+            "the .npz file of the poses."
         )
     return notes
 

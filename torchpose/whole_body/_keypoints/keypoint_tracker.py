@@ -39,6 +39,7 @@ LEAST_JOINTS = 6  # that are measured where tracking begins
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
+_AWAY = 0.5  # of a lost frame counts one in which several cameras see nobody: a second until a new start
 
 
 class KeypointStream(NamedTuple):
@@ -46,8 +47,8 @@ class KeypointStream(NamedTuple):
 
     Attributes:
         state: Gaussians of [B]. begun: [B], whether the person was found.
-        lost: [B], for how many frames in a row most keypoints have been of something else, or the person has
-            waited for a start.
+        lost: [B], for how many frames in a row most keypoints have been of something else, or there were
+            none, which counts half, or the person has waited for a start.
         alone: [B], which of several cameras alone the person is followed by, -1 if by all.
         memory: [B, L, W], of the network that lifts keypoints of one camera.
     """
@@ -356,7 +357,9 @@ class KeypointTracker(nn.Module):
         """Return for how many frames in a row keypoints have been of something else, or of the other side.
 
         A camera that seems to exchange sides counts half: detectors do so for moments, and where it goes on,
-        it is the body that has them the wrong way round.
+        it is the body that has them the wrong way round. Frames without any keypoint count half, too, of
+        several cameras: a prediction over more than a second is too wide to be corrected. In one camera the
+        network tells where the prediction is wrong.
         """
         expected = frame.inlier.sum((-2, -1))
         found = (weighed.own + weighed.other).sum((-2, -1))
@@ -365,7 +368,8 @@ class KeypointTracker(nn.Module):
         astray = (found < _LOST * expected) | turned
         lost = torch.where(astray, grown, 0.0)
         lost = torch.where(stream.begun, lost, stream.lost + 1)
-        return torch.where(expected > 0, lost, stream.lost)
+        away = stream.begun.to(lost) * (_AWAY if self.lifter is None else 0.0)
+        return torch.where(expected > 0, lost, stream.lost + away)
 
     # --- whole sequences --------------------------------------------------------------------------
 
