@@ -321,10 +321,12 @@ def check_gaps(
         inside = frames < lengths.to(measured.device)[:, None]
     seen = measured.any(-1) & inside
     empty = torch.nonzero(~seen.any(1)).flatten().tolist()
+    several = batch > 1
     if empty:
+        which = f" of sequence {empty[0]} ({len(empty)} such sequences)" if several else ""
         raise InputError(
-            f"no joint is measured in any frame of sequence {empty[0]} "
-            f"({len(empty)} such sequences); expected keypoints of some of {', '.join(UPPER_BODY)}"
+            f"no joint is measured in any frame{which}; expected keypoints of some of "
+            f"{', '.join(UPPER_BODY)}"
         )
     if max_gap is None:
         return
@@ -333,9 +335,9 @@ def check_gaps(
     if bool((gap > max_gap * fps).any()):
         b, t = (int(i) for i in torch.nonzero(gap == gap.max())[0])
         raise InputError(
-            f"nothing is measured for {int(gap[b, t])} frames, from frame "
-            f"{int(last_seen[b, t]) + 1} of sequence {b} on, longer than max_gap = {max_gap} s; "
-            "cut the recording there, or raise max_gap to have the prior fill it"
+            f"nothing is measured for {int(gap[b, t])} frames, from frame {int(last_seen[b, t]) + 1}"
+            f"{f' of sequence {b}' if several else ''} on, longer than max_gap = {max_gap} s; cut the "
+            "recording there, or raise max_gap (--max-gap) to have the prior fill it"
         )
 
 
