@@ -1,15 +1,15 @@
-"""How well are persons tracked whom no prior saw, if all eight joints are measured?
+"""How well are persons tracked whom no prior saw, from all eight joints, and from head, neck and hands?
 
 Persons s7 and s8 of UTD-MHAD in the test camera of `python -m benchmarks.ub_people`, with 3 px of noise on
-each joint. Priors and learned lifters know s1 to s6, the prior over arms all sets without s7 and s8. Beside
-them stand arms that are lifted by geometry, which is told what no image shows:
+each measured joint. Priors and learned lifters know s1 to s6, the prior over arms all sets without s7 and
+s8. Of all joints, arms that are lifted by geometry stand beside them, which is told what no image shows:
 
 - how deep head, neck and shoulders are in every frame, else all as deep as the neck;
 - the lengths of the person's bones, on average over a recording, or in every single frame, since Kinect's
   bones change their lengths;
 - which end of a bone is nearer, else the nearer one of both places is taken.
 
-    python -m benchmarks.ub_people_all_joints --data DIR --out DIR [--every 6]
+    python -m benchmarks.ub_people_joints --data DIR --out DIR [--every 6]
 
 Priors are kept in the second folder.
 """
@@ -37,6 +37,7 @@ from torchpose.evaluation import Report
 from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.evaluation._trials import (
     CAMERA,
+    MEASURED,
     Estimate,
     Trials,
     cached_prior,
@@ -59,6 +60,8 @@ _SETTINGS: dict[str, Any] = {
     "calibration_folds": 0,  # covariances do not change the poses
 }
 
+_MEASURED = {"all eight joints": tuple(UPPER_BODY), "head, neck and hands": MEASURED}
+
 Lengths = Literal["own", "in every frame"]
 
 
@@ -71,7 +74,7 @@ def main(
     threads: int = 2,
     quick: bool = False,
 ) -> None:
-    """Print the table.
+    """Print both tables.
 
     Args:
         data: folder with all sets. out: folder for fitted priors.
@@ -84,21 +87,29 @@ def main(
     train, tested = people(data, quick)
     tested = tested if quick else tested[::every]
     poses = [centred_on_neck(r.upper_body().joints) for r in tested]
-    test = make_test_set(poses, CAMERA, tested[0].fps or 30.0, seed, names=tuple(UPPER_BODY))
-    report = Report("UB-people, all joints measured")
-    table = report.table(
-        "errors_3d", "3D error after Procrustes (cm), all eight joints measured",
-        ["mean", *SHORT_NAMES], digits=(2, *[1] * 8),
-    )  # fmt: skip
-    methods = _trackers(data, out, train, seed, quick) | _learned(train, seed, quick) | _LIFTS
-    for name, method in tqdm(methods.items(), desc="methods"):
-        scores = score(method(test), test)
-        table.add(name, [scores.mean_error, *(100 * scores.errors3d[test.inside].mean(0)).tolist()])
-    table.note = f"{len(tested)} sequences, {int(test.lengths.sum())} frames."
-    print(table.to_markdown())
+    trackers = _trackers(data, out, train, seed, quick)
+    report = Report("UB-people by measured joints")
+    for title, names in _MEASURED.items():
+        test = make_test_set(poses, CAMERA, tested[0].fps or 30.0, seed, names=names)
+        lifts = _LIFTS if names == UPPER_BODY else {}
+        methods = trackers | _learned(train, names, seed, quick) | lifts
+        _add_table(report, title, methods, test)
+    print("\n\n".join(table.to_markdown() for table in report.values()))
 
 
 Method = Callable[[Trials], Estimate]
+
+
+def _add_table(report: Report, measured: str, methods: Mapping[str, Method], test: Trials) -> None:
+    """Add the errors of methods on a test set, of which these joints are measured."""
+    table = report.table(
+        measured, f"3D error after Procrustes (cm), measured: {measured}",
+        ["mean", *SHORT_NAMES], digits=(2, *[1] * 8),
+    )  # fmt: skip
+    for name, method in tqdm(methods.items(), desc=measured):
+        scores = score(method(test), test)
+        table.add(name, [scores.mean_error, *(100 * scores.errors3d[test.inside].mean(0)).tolist()])
+    table.note = f"{len(test.lengths)} sequences, {int(test.lengths.sum())} frames."
 
 
 def _trackers(
@@ -123,10 +134,11 @@ def _tracked(prior: UpperBodyPrior, options: Mapping[str, Any], test: Trials) ->
     return track(prior, CAMERA, test, **options)
 
 
-def _learned(train: list[Recording], seed: int, quick: bool) -> dict[str, Method]:
-    """Return lifters that learn from the training persons."""
+def _learned(
+    train: list[Recording], names: tuple[str, ...], seed: int, quick: bool
+) -> dict[str, Method]:
+    """Return lifters of these joints that learn from the training persons."""
     poses = [centred_on_neck(r.upper_body().joints).float() for r in train]
-    names = tuple(UPPER_BODY)
     known = projected_training_poses(train, CAMERA, 2_000 if quick else 100_000, seed)
 
     return {

@@ -1,8 +1,8 @@
-"""All eight joints of persons whom no prior saw: geometry that is told the truth, and a quick run."""
+"""Persons whom no prior saw, by measured joints: geometry that is told the truth, and a quick run."""
 
 import torch
 
-from benchmarks.ub_people_all_joints import lifted
+from benchmarks.ub_people_joints import lifted
 from tests.evaluation.recordings import write_people
 from torchpose.evaluation._trials import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import read_recordings
@@ -26,7 +26,7 @@ def test_geometry_that_is_told_everything_finds_the_truth_where_pixels_are_exact
 
 def test_a_quick_run_has_trackers_learned_lifters_and_geometry(run_here, few_people, tmp_path):
     printed = run_here(
-        "ub_people_all_joints", "--quick", "--data", str(few_people), "--out", str(tmp_path)
+        "ub_people_joints", "--quick", "--data", str(few_people), "--out", str(tmp_path)
     )
     rows = {
         line.split("|")[1].strip(): line.split("|")[2:-1]
@@ -37,3 +37,4 @@ def test_a_quick_run_has_trackers_learned_lifters_and_geometry(run_here, few_peo
               "mean pose", "geometry, told depths of the torso, lengths, nearer ends")  # fmt: skip
     for name in wanted:
         assert 0 < float(rows[name][0]) < 100, name
+    assert printed.count("| GRU, causal |") == 2  # all joints, and few
