@@ -19,7 +19,7 @@ lifts the keypoints of one camera.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -42,7 +42,7 @@ from benchmarks.keypoint_bodies.clips import (
     read_kinect,
 )
 from benchmarks.keypoint_bodies.lifting import fit_shipped
-from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, methods_of
+from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, Method, methods_of
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.tables import add_table
 from torchpose.evaluation import Report
@@ -90,21 +90,26 @@ def main(
         clips = {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
     if choose:
         add_choices(report, clips)
-    elif noise_alone:
-        for cameras in (count for count in RIGS if count > 1):
-            add_table(report, methods_of(methods, data, lifters, quick), clips, cameras)
     else:
         chosen = methods_of(methods, data, lifters, quick)
-        for cameras in RIGS:
+        for cameras in (count for count in RIGS if count > 1 or not noise_alone):
             add_table(report, chosen, clips, cameras)
-        kinect = read_kinect(data, KINECT_SCORED[:1] if quick else KINECT_SCORED)
-        add_table(report, chosen, {KINECT: kinect}, 1, _KINECT_TITLE)
-        other = read_kinect(data, ("Ges01*",) if quick else ("*",), folder=OTHER_KINECT)
-        add_table(report, chosen, {OTHER_KINECT: other}, 1, _OTHER_TITLE)
-        add_real_table(report, chosen, data, quick)
+        if not noise_alone:
+            _add_recorded_views(report, chosen, data, quick)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
     save_text(out, "\n\n".join(tables) + "\n")
+
+
+def _add_recorded_views(
+    report: Report, methods: Mapping[str, Method], data: Path, quick: bool
+) -> None:
+    """Add the tables of persons whom a Kinect recorded, and of real cameras."""
+    kinect = read_kinect(data, KINECT_SCORED[:1] if quick else KINECT_SCORED)
+    add_table(report, methods, {KINECT: kinect}, 1, _KINECT_TITLE)
+    other = read_kinect(data, ("Ges01*",) if quick else ("*",), folder=OTHER_KINECT)
+    add_table(report, methods, {OTHER_KINECT: other}, 1, _OTHER_TITLE)
+    add_real_table(report, methods, data, quick)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Choose the camera of an input: the one given, the one that the input names, or a reported guess.
 
-A calibrated camera is fitted to the size of the images that the input has.
+A calibrated camera is fitted to the size of the images that the input has. Cameras whose poses cannot be
+those of one room are refused.
 """
 
 from itertools import combinations

@@ -91,7 +91,6 @@ def cut_windows(image: Image, anchors: Float[Tensor, "N 3"]) -> list[NDArray[np.
     import cv2
 
     rows, columns = CELLS
-    border = cv2.BORDER_REPLICATE
     steps = _pixels_to_one(anchors[:, 2]).int().tolist()
     cut: list[NDArray[np.uint8]] = []
     for (x, y, size), step in zip(anchors.tolist(), steps, strict=True):
@@ -100,7 +99,7 @@ def cut_windows(image: Image, anchors: Float[Tensor, "N 3"]) -> list[NDArray[np.
         left = round((x + _LEFT * size + 0.5) / step)
         top = round((y + _TOP * size + 0.5) / step)
         part, beyond = _blocks(image, left, top, width, height, step)
-        whole = cv2.copyMakeBorder(part, *beyond, border) if any(beyond) else part
+        whole = cv2.copyMakeBorder(part, *beyond, cv2.BORDER_REPLICATE) if any(beyond) else part
         target = (columns * COLOURS, rows * COLOURS)
         cut.append(cv2.resize(whole, target, interpolation=cv2.INTER_LINEAR))  # type: ignore[arg-type]
     return cut

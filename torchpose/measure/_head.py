@@ -262,12 +262,8 @@ def _box(size: int, width: int) -> Tensor:
     place = torch.arange(size)[:, None] + torch.arange(width) - width // 2
     place = place.abs()
     place = torch.where(place >= size, 2 * (size - 1) - place, place)
-    return (
-        torch.zeros(size, size, dtype=torch.float32).scatter_add_(
-            1, place, torch.ones(size, width, dtype=torch.float32)
-        )
-        / width
-    )
+    ones = torch.ones(size, width, dtype=torch.float32)
+    return ones.new_zeros(size, size).scatter_add_(1, place, ones) / width
 
 
 @cache

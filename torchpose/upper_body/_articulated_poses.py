@@ -117,19 +117,19 @@ def pose_of(
     both = known.all(1)[..., None, None]
     arms = torch.where(both, _with_lengths(means, body.lengths), means)
     ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
-    off = (ends - arms[:, :, None]).transpose(2, 3)
+    off = (ends - means[:, :, None]).transpose(2, 3)
     spread = (belief.weight[:, :, None, :, None] * off).mT @ off
     limbs = (shoulders[:, :, None] + arms).transpose(1, 2).flatten(1, 2)
     moved = (means - arms).transpose(1, 2).flatten(1, 2)
     joints = body.joints.index_copy(1, _limb_rows(limbs.device), limbs)
-    covs = _covs(body, joints, spread.transpose(1, 2).flatten(1, 2))
     trust = torch.ones_like(joints[..., 0])
     if calibrated:
         of_limbs = _trust(body.known, body.exact).to(trust).repeat(1, 2)
-        trust = trust.index_copy(1, _limb_rows(covs.device), of_limbs)
-    covs = trust[..., None, None] * covs
+        trust = trust.index_copy(1, _limb_rows(limbs.device), of_limbs)
+    trust = trust[..., None, None]
+    mean_covs = trust * _covs(body, joints, spread.transpose(1, 2).flatten(1, 2))
     apart = torch.zeros_like(joints).index_copy(1, _limb_rows(limbs.device), moved)
-    about = covs - trust[..., None, None] * apart[..., :, None] * apart[..., None, :]
+    covs = mean_covs + trust * apart[..., :, None] * apart[..., None, :]
     area = 2 * shoulders[..., 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
     evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]
     evidence = torch.where(known.any(1), evidence, 0.0)
@@ -137,7 +137,7 @@ def pose_of(
     weight = belief.weight.clamp_min(1e-30).log()
     return FramePose(
         joints @ body.tilt.mT, tilt @ covs @ tilt.mT, (joints + apart) @ body.tilt.mT,
-        tilt @ about @ tilt.mT, body.turn, body.tilt, evidence, weight, body.bones.metres,
+        tilt @ mean_covs @ tilt.mT, body.turn, body.tilt, evidence, weight, body.bones.metres,
         body.bones.covs,
     )  # fmt: skip
 

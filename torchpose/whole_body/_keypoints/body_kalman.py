@@ -372,7 +372,7 @@ class BodyKalmanFilter(nn.Module):
         sums, count = squared_errors(readings, seen, weighed, joint_cov)
         if len(self.maps.shift) > 2:  # of two cameras nothing tells which is wrong
             least = FEW_INLIERS * readings.inlier[0].sum(-1)
-            few = ((weighed.own + weighed.other).sum(-1) < least).any(-1, keepdim=True)
+            few = (weighed.inlier.sum(-1) < least).any(-1, keepdim=True)
             if bool(few.any()):
                 beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), scale)
                 wider = self._by_wider(readings, seen, beliefs, joint_cov)

@@ -122,6 +122,11 @@ class Weighed(NamedTuple):
     log_joint: Tensor
     log_evidence: Tensor
 
+    @property
+    def inlier(self) -> Float[Tensor, "B C J"]:
+        """Return the probability that a keypoint of either side is of the joint."""
+        return self.own + self.other
+
 
 def exchange_of(skeleton: BodySkeleton, device: torch.device) -> Exchange:
     """Return the groups of joints whose sides may be exchanged: arms, legs."""

@@ -73,7 +73,7 @@ def _by_wider(
     Where calibrations are wrong, no three cameras agree on a joint by the usual noise. Two that do not
     agree may as well see two persons.
     """
-    share = (found.weighed.own + found.weighed.other).sum((-2, -1)) / frame.inlier.sum((-2, -1))
+    share = found.weighed.inlier.sum((-2, -1)) / frame.inlier.sum((-2, -1))
     several = (frame.inlier > 0).any(-1).sum(-1) > 2
     rows = ((share < FEW_INLIERS) & several).nonzero().squeeze(-1)
     if not len(rows):

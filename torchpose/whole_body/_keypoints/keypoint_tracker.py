@@ -183,7 +183,7 @@ class KeypointTracker(nn.Module):
                 found = self._begun_anew(found, frame, lifted, due)
             lost, alone = torch.where(due, 0.0, stream.lost), torch.where(due, NOBODY, stream.alone)
             stream = KeypointStream(found.state, stream.begun | due, lost, alone, memory)
-        inlier = found.weighed.own + found.weighed.other
+        inlier = found.weighed.inlier
         stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
         pose = KeypointPoses(
             found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
@@ -362,7 +362,7 @@ class KeypointTracker(nn.Module):
         network tells where the prediction is wrong.
         """
         expected = frame.inlier.sum((-2, -1))
-        found = (weighed.own + weighed.other).sum((-2, -1))
+        found = weighed.inlier.sum((-2, -1))
         turned = (weighed.exchanged > 0.5).any(-1).any(-1)
         grown = stream.lost + torch.where(found < _LOST * expected, 1.0, 0.5)
         astray = (found < _LOST * expected) | turned
