@@ -68,13 +68,17 @@ class View(NamedTuple):
         return float(self.truth[..., 0, 2].nanmean()) if self.depth is None else self.depth
 
 
-def mhad_views(data: Path, every: int = EVERY) -> list[View]:
+def mhad_views(data: Path, every: int = EVERY, pitch: float = 0.0) -> list[View]:
     """Return one recording in fifteen of Berkeley MHAD, 150 frames each, in a camera at 2.5 m.
 
     Args:
         data: folder with mocap_berkeley_mhad/. every: one recording in so many.
+        pitch: the angle by which the camera looks up, radians; it turns about the neck.
     """
     camera = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
+    tilted = camera.tilted(
+        pitch
+    ).level_rotation.numpy()  # level axes from the left, camera from the right
     rng = np.random.default_rng(0)
     views = []
     for path in data_files(data / "mocap_berkeley_mhad", "**/*.npz")[7::every]:
@@ -82,7 +86,8 @@ def mhad_views(data: Path, every: int = EVERY) -> list[View]:
             names = [str(name) for name in file["names"]]
             picked = [names.index(name) for name in _MHAD]
             joints = file["joints"][:_FRAMES, picked].astype(float) * np.array([1, -1, -1.0])
-        joints = joints - joints[:, [3]] + np.array(_PLACE)
+        joints = joints - joints[:, [3]]
+        joints = (joints @ tilted if pitch else joints) + np.array(_PLACE)
         pixels = joints[..., :2] / joints[..., 2:] * 525 + np.array([319.5, 239.5])
         pixels = torch.tensor(pixels + rng.normal(0, _STD, pixels.shape))
         truth = torch.tensor(joints)[:, arm_rows(_SEVEN)]

@@ -4,6 +4,7 @@ A calibrated camera is fitted to the size of the images that the input has. Came
 those of one room are refused.
 """
 
+import math
 from itertools import combinations
 from pathlib import Path
 
@@ -72,6 +73,39 @@ def resolve_camera(
         f"no camera can be told for {source}: expected --camera FILE or "
         "--camera fx,fy,cx,cy, or K or image_size in the keypoint file; got none of them"
     )
+
+
+def held_camera(
+    camera: PinholeCamera,
+    tilt: float | None,
+    roll: float | None,
+    up: str | None,
+    given: str | None,
+) -> PinholeCamera:
+    """Return the camera with the orientation against gravity that options state; without any as it is.
+
+    Args:
+        camera: the camera of the input. tilt: degrees by which it looks up.
+        roll: degrees by which it is rolled clockwise.
+        up: the axis of the world that points up, by which its rotation tells both.
+        given: the text that stated the camera, if one did.
+
+    Raises:
+        InputError: angles and an axis, or an axis without a file of cameras.
+        CameraError: it looks up or down by more than 60 degrees.
+    """
+    if up is not None:
+        if tilt is not None or roll is not None:
+            raise InputError("--up tells tilt and roll by the camera's rotation; give one of them")
+        if not given or _is_numbers(given):
+            raise InputError(
+                f"--up {up} needs --camera FILE with the rotation of the camera; give --tilt and --roll in "
+                "degrees otherwise"
+            )
+        return camera.with_world_up(up)
+    if tilt is None and roll is None:
+        return camera
+    return camera.tilted(math.radians(tilt or 0.0), math.radians(roll or 0.0))
 
 
 def _given_camera(given: str, name: str | None, size: tuple[int, int] | None) -> PinholeCamera:
@@ -149,7 +183,7 @@ def _of_size(camera: PinholeCamera, matrix: Tensor, size: tuple[int, int]) -> Pi
     return PinholeCamera(
         fx, fy, cx, cy, *size, camera.name, skew=skew, distortions=camera.distortions.tolist(),
         rotation=camera.rotation.tolist(), translation=camera.translation.tolist(),
-        fisheye=camera.fisheye,
+        fisheye=camera.fisheye, up=None if camera.up is None else camera.up.tolist(),
     )  # fmt: skip
 
 

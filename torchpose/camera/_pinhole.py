@@ -16,12 +16,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_floating, check_real
+from torchpose._core.checks import check_choice, check_floating, check_real
 from torchpose.camera._projection import (
     check_intrinsics,
     intrinsics,
     project,
 )
+from torchpose.camera._tilt import level_rotation, unit_up, up_of_angles
 from torchpose.errors import CameraError, FileFormatError, InputError
 from torchpose.math._rotations import (
     rotvec_to_matrix,
@@ -30,7 +31,7 @@ from torchpose.math._rotations import (
 _FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
 _LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none
 _LARGEST_SIDE = 100_000  # pixels of an image
-_KEYS = ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye")
+_KEYS = ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye", "up")
 _ALIKE = 0.8  # of two keys, of which one is the other misspelt
 FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a webcam
 
@@ -47,11 +48,16 @@ class PinholeCamera(nn.Module):
         rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues
             vector in radians, and metres. The identity without them.
         fisheye: the distortions are OpenCV's fisheye model.
+        up: the direction that points up, against gravity, in the axes of the camera, of any length; None is
+            unknown, and trackers take the camera to be about level, (0, -1, 0). `tilted` makes it of angles,
+            `with_world_up` of the rotation.
 
-    Buffers: matrix [3, 3], distortions [n], rotation [3], translation [3], all float64.
+    Buffers: matrix [3, 3], distortions [n], rotation [3], translation [3], all float64; up [3], of length
+        one, or None.
 
     Raises:
-        CameraError: a focal length is not positive and finite, or another value is not finite.
+        CameraError: a focal length is not positive and finite, another value is not finite, or the camera
+            looks up or down by more than 60 degrees.
 
     >>> PinholeCamera(525, 525, 319.5, 239.5).matrix[0]
     tensor([525.0000,   0.0000, 319.5000], dtype=torch.float64)
@@ -61,6 +67,7 @@ class PinholeCamera(nn.Module):
     distortions: Tensor
     rotation: Tensor
     translation: Tensor
+    up: Tensor | None
 
     def __init__(
         self,
@@ -77,6 +84,7 @@ class PinholeCamera(nn.Module):
         rotation: Sequence[float] = (0.0, 0.0, 0.0),
         translation: Sequence[float] = (0.0, 0.0, 0.0),
         fisheye: bool = False,
+        up: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         self.name = name
@@ -96,6 +104,7 @@ class PinholeCamera(nn.Module):
             )
         self.register_buffer("rotation", turn)
         self.register_buffer("translation", _vector(f"translation of {label}", translation, 3))
+        self.register_buffer("up", _direction(f"up of {label}", up))
 
     @classmethod
     def from_matrix(
@@ -193,6 +202,59 @@ class PinholeCamera(nn.Module):
         """Return R [3, 3] of the Rodrigues vector `rotation`, world axes to camera axes."""
         return rotvec_to_matrix(self.rotation)
 
+    @property
+    def level_rotation(self) -> Float[Tensor, "3 3"]:
+        """Return the rotation from camera axes to those of a level camera with the same heading.
+
+        It is the identity where `up` is unknown. `joints3d @ camera.level_rotation.mT` are upright.
+        """
+        return torch.eye(3).to(self.matrix) if self.up is None else level_rotation(self.up)
+
+    def tilted(self, pitch: float, roll: float = 0.0) -> Self:
+        """Return the camera with the orientation against gravity that these angles say.
+
+        Args:
+            pitch: the angle by which it looks up, radians; negative is down.
+            roll: the angle by which it is rolled clockwise, as one who stands behind it sees it, radians. The
+                image then shows upright things rolled the other way.
+
+        Returns:
+            A copy with `up` = (-sin r cos p, -cos r cos p, sin p).
+
+        Raises:
+            CameraError: angles that are not finite, or a pitch of more than 60 degrees.
+
+        >>> import math
+        >>> camera = PinholeCamera(525, 525, 319.5, 239.5).tilted(math.radians(30))
+        >>> [round(float(x), 3) for x in camera.up]
+        [0.0, -0.866, 0.5]
+        """
+        angles = _vector("pitch and roll", [pitch, roll], 2).tolist()
+        return self._with_up(up_of_angles(*angles))
+
+    def with_world_up(self, axis: str) -> Self:
+        """Return the camera of a calibrated rig with the orientation against gravity that its rotation says.
+
+        Args:
+            axis: "y" or "z", the axis of the world that points up.
+
+        Returns:
+            A copy with `up` = R(rotation) e_axis.
+
+        Raises:
+            InputError: another axis. CameraError: it looks up or down by more than 60 degrees.
+        """
+        check_choice("axis", axis, ("y", "z"))
+        return self._with_up(self.rotation_matrix[:, "xyz".index(axis)].tolist())
+
+    def _with_up(self, up: Sequence[float]) -> Self:
+        fx, fy, skew, cx, cy = (float(e) for e in intrinsics(self.matrix))
+        return type(self)(
+            fx, fy, cx, cy, self.width, self.height, self.name, skew=skew,
+            distortions=self.distortions.tolist(), rotation=self.rotation.tolist(),
+            translation=self.translation.tolist(), fisheye=self.fisheye, up=up,
+        ).to(self.matrix.device)  # fmt: skip
+
     def forward(self, points: Float[Tensor, "... J 3"]) -> Float[Tensor, "... J 3"]:
         """Project world points by K, rotation and translation (BL 3); distortions are not applied.
 
@@ -212,15 +274,17 @@ class PinholeCamera(nn.Module):
     def extra_repr(self) -> str:
         fx, fy, _, cx, cy = (float(e) for e in intrinsics(self.matrix))
         size = "" if self.image_size is None else f", width={self.width}, height={self.height}"
-        return f"fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g}{size}, name={self.name!r}"
+        up = "" if self.up is None else f", up={[round(x, 3) for x in self.up.tolist()]}"
+        return f"fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g}{size}{up}, name={self.name!r}"
 
 
 def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     """Read every camera of a TOML file.
 
     One table per camera with `matrix` (3 x 3, pixels) and, optionally, `size` (width, height),
-    `distortions`, `rotation` (Rodrigues vector), `translation` (metres), `name`, `fisheye`. A table
-    `[metadata]` is passed over. Pose2Sim and Anipose write such files.
+    `distortions`, `rotation` (Rodrigues vector), `translation` (metres), `name`, `fisheye`, `up` (the
+    direction that points up, camera axes). A table `[metadata]` is passed over. Pose2Sim and Anipose
+    write such files.
 
     Args:
         path: the file.
@@ -310,6 +374,10 @@ def _vector(name: str, values: Any, length: int | None) -> Tensor:
     return vector
 
 
+def _direction(name: str, up: Any) -> Tensor | None:
+    return None if up is None else unit_up(name, _vector(name, up, 3))
+
+
 def _numbers(name: str, values: Any, wanted: str = "numbers") -> Tensor:
     """Return a tensor of numbers; true and false are none."""
     try:
@@ -360,6 +428,7 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
             rotation=table.get("rotation", (0.0, 0.0, 0.0)),
             translation=table.get("translation", (0.0, 0.0, 0.0)),
             fisheye=bool(table.get("fisheye", False)),
+            up=table.get("up"),
         )  # fmt: skip
     except CameraError as error:
         raise CameraError(f"{where}: {error}") from error
@@ -387,4 +456,6 @@ def _camera_to_toml(name: str, camera: PinholeCamera) -> str:
         # repr of a Python float is the shortest text that reads back to the same number
         lines.append(f"{key} = {getattr(camera, key).double().tolist()}")
     lines.append(f"fisheye = {str(camera.fisheye).lower()}")
+    if camera.up is not None:
+        lines.append(f"up = {camera.up.double().tolist()}")
     return "\n".join(lines) + "\n"

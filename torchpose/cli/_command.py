@@ -23,7 +23,8 @@ _METAVARS = {
     "initial_pose": "FILE", "licence": "TEXT", "manifold": "NAME|FILE", "max_gap": "S",
     "measurement_std": "PX", "motion": "NAME|FILE", "neck": "KIND", "noise_of": "PRIOR",
     "out": "DIR", "person": "FILE", "persons": "PERSON", "prior": "NAME|FILE",
-    "recordings": "DIR", "seconds": "S", "smoothing": "N|full", "videos": "VIDEO",
+    "recordings": "DIR", "roll": "DEGREES", "seconds": "S", "smoothing": "N|full", "tilt": "DEGREES",
+    "videos": "VIDEO",
     "what": "PRIOR|FILE", "window_components": "K", "without": "PERSON", "without_files": "NAME",
 }  # fmt: skip
 _HOW = ("out", "config", "pictures")  # no part of what is made

@@ -1,5 +1,6 @@
 """What `torchpose track` has for keypoints and for video: the job, the files, what is printed."""
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -164,9 +165,21 @@ def report_failure(track: "PoseTrack") -> int:
 
 
 def camera_text(camera: Any) -> str:
-    """Return the focal lengths and the centre of a camera in words."""
+    """Return the focal lengths and the centre of a camera in words, and where it looks if that is known."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    return f"f = ({fx:g}, {fy:g}), centre ({cx:g}, {cy:g}) pixels"
+    return f"f = ({fx:g}, {fy:g}), centre ({cx:g}, {cy:g}) pixels{_tilt_text(camera)}"
+
+
+def _tilt_text(camera: Any) -> str:
+    """Return in words by how much a camera looks up or down and is rolled; nothing if that is not known."""
+    from torchpose.camera._tilt import angles_of_up
+
+    if camera.up is None:
+        return ""
+    pitch, roll = (round(math.degrees(angle), 1) for angle in angles_of_up(camera.up))
+    way = "up" if pitch >= 0 else "down"
+    rolled = "" if abs(roll) < 0.05 else f" and rolled by {roll:g} degrees"
+    return f", looking {way} by {abs(pitch):g} degrees{rolled}"
 
 
 def smoothing_text(smoothing: int | str | None) -> str:

@@ -55,6 +55,7 @@ def track_video(
             camera, notes = resolve_camera(
                 settings.camera, settings.camera_name, source.size, None, job.input
             )
+            camera = settings.hold(camera)
             tracker = _tracker(job, options, face_model, prior, camera, source.fps)
             results = stack.enter_context(track_results(job.out, job.files, pictures, overlay))
             start = time.perf_counter()

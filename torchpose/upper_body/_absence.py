@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._tilt import Turn
 from torchpose.errors import InputError
 from torchpose.math._half_planes import log_outside
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -37,7 +38,10 @@ class Absence(NamedTuple):
 
 
 def absence_of(
-    absent: Float[Tensor, "B T 2"], camera: PinholeCamera, matrix: Float[Tensor, "3 3"]
+    absent: Float[Tensor, "B T 2"],
+    camera: PinholeCamera,
+    matrix: Float[Tensor, "3 3"],
+    turn: Turn | None = None,
 ) -> Absence | None:
     """Return the evidence of probabilities that hands cannot be seen; None if nothing is known of any.
 
@@ -51,6 +55,7 @@ def absence_of(
     Args:
         absent: g of both hands; NaN where nothing is known. camera: of the image.
         matrix: K of the prior's camera, in whose pixels the borders are.
+        turn: the turn of these pixels that makes the camera level; None if it is.
 
     Raises:
         InputError: a camera without the size of its image, or probabilities outside [0, 1].
@@ -75,6 +80,7 @@ def absence_of(
     )
     own, wanted = camera.matrix.to(absent), matrix.to(absent)
     lines = torch.linalg.solve_triangular(wanted.mT, (lines @ own).mT, upper=False).mT
+    lines = lines if turn is None else turn.lines(lines)
     return Absence(ratio.log(), lines / (_SOFT * max(width, height)))
 
 

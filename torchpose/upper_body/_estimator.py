@@ -38,6 +38,8 @@ class TrackerModel(NamedTuple):
             shoulders their middle alone is measured.
         calibrated: whether covariances are recalibrated by the noise of the prior.
         steadied: whether the poses of windows pass filters of constant velocity.
+        upright: whether the camera's orientation against gravity is known, and measurements are those of a
+            level camera; else it is about level.
     """
 
     owner: nn.Module
@@ -49,6 +51,7 @@ class TrackerModel(NamedTuple):
     middle: tuple[bool, bool] = (False, False)
     calibrated: bool = True
     steadied: bool = True
+    upright: bool = False
 
     @property
     def rate(self) -> float:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 
 from torchpose._core.inference import in_inference_mode
-from torchpose.camera._choice import resolve_camera
+from torchpose.camera._choice import held_camera, resolve_camera
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.io._keypoints import Keypoints
@@ -37,6 +37,11 @@ class TrackSettings:
         camera: the camera: a TOML file, or four numbers fx,fy,cx,cy in pixels; by default K or the image
             size of the input.
         camera_name: the name of the camera in a file that has several.
+        tilt: the angle in degrees by which the camera looks up, as most webcams of laptops do; negative if it
+            looks down (default: about level).
+        roll: the angle in degrees by which the camera is rolled clockwise, as seen from behind it.
+        up: the axis of the world that points up, y or z, by which the rotation in the file of the camera
+            tells tilt and roll.
         measurement_std: the standard deviation of a keypoint in pixels: one number, or five with commas
             for hand, elbow, shoulder, head, neck; by default as the prior learnt it, else 3.
         smoothing: use this many later frames, or all of them ("full"), for each estimate, or none of them
@@ -71,6 +76,9 @@ class TrackSettings:
     method: str | None = None
     camera: str | None = None
     camera_name: str | None = None
+    tilt: float | None = None
+    roll: float | None = None
+    up: str | None = None
     measurement_std: float | list[float] | None = None
     smoothing: int | str | None = None
     n_particles: int | None = None
@@ -89,6 +97,14 @@ class TrackSettings:
     max_gap: float | None = 5.0
     outliers: bool = True
     seed: int = 0
+
+    def hold(self, camera: PinholeCamera) -> PinholeCamera:
+        """Return the camera with the orientation against gravity that is stated, if one is.
+
+        Raises:
+            InputError, CameraError: settings that do not go together, or a camera that looks too far up.
+        """
+        return held_camera(camera, self.tilt, self.roll, self.up, self.camera)
 
     def tracker_options(self) -> dict[str, Any]:
         """Return the settings of the tracker and of its filter, as `UpperBodyTracker` takes them.
@@ -155,6 +171,7 @@ class _Key(NamedTuple):
 
     matrix: tuple[float, ...]
     size: tuple[int, int] | None
+    up: tuple[float, ...] | None
     fps: float | None
     neck: str | None
 
@@ -206,7 +223,12 @@ class KeypointFileTracker:
         settings = self.settings
         UpperBodyTracker(self.prior, self.prior.camera, **self._options, neck=settings.neck)
         if settings.camera:
-            resolve_camera(settings.camera, settings.camera_name, None, None, settings.camera)
+            camera, _ = resolve_camera(
+                settings.camera, settings.camera_name, None, None, settings.camera
+            )
+            settings.hold(camera)
+        else:
+            settings.hold(self.prior.camera)
 
     def prepare(self, keypoints: Keypoints) -> PreparedTracker:
         """Return the tracker of a file, and what was assumed.
@@ -222,6 +244,7 @@ class KeypointFileTracker:
             keypoints.K,
             keypoints.path,
         )
+        camera = settings.hold(camera)
         refuse_another_size(keypoints, keypoints.image_size or camera.image_size)
         names, more = _joint_names(keypoints, settings.nose_as_head)
         fps = settings.fps or keypoints.fps
@@ -231,6 +254,7 @@ class KeypointFileTracker:
         key = _Key(
             tuple(camera.matrix.flatten().tolist()),
             camera.image_size,
+            None if camera.up is None else tuple(camera.up.tolist()),
             fps,
             _kind_of_neck(settings.neck, keypoints),
         )

@@ -12,6 +12,7 @@ from torchpose._core.checks import check_covariance, check_finite, check_floatin
 from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
+from torchpose.camera._tilt import Turn
 from torchpose.errors import InputError
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -214,6 +215,49 @@ def kept_pixel_maps(camera: PinholeCamera, prior: UpperBodyPrior) -> tuple[Pixel
     return derived(camera, name, (camera.matrix,), make)
 
 
+def kept_turn(camera: PinholeCamera, prior: UpperBodyPrior) -> Turn | None:
+    """Return the turn of the prior's pixels that makes a camera level; None where it is, or may be.
+
+    Args:
+        camera: the camera of the keypoints. prior: the prior, in whose pixels the turn is.
+    """
+    up, info = camera.up, prior.info
+    if up is None:
+        return None
+
+    def make() -> Turn | None:
+        turn = Turn.to_level(up, info.matrix.to(camera.matrix))
+        level = torch.equal(turn.rotation, torch.eye(3).to(turn.rotation))
+        return None if level else turn
+
+    return derived(camera, ("level", info.fx, info.fy, info.cx, info.cy), (up, camera.matrix), make)
+
+
+def in_level_pixels(
+    measured: MeasuredJoints, turn: Turn | None, matrix: Float[Tensor, "3 3"]
+) -> MeasuredJoints:
+    """Return measurements as the level camera has them, with R of each joint in each frame.
+
+    What is seen more than 84 degrees beside the level camera's axis is not measured.
+
+    Args:
+        measured: the measurements in the prior's pixels. turn: `kept_turn`; None changes nothing.
+        matrix: K of these pixels.
+    """
+    if turn is None:
+        return measured
+    uv, mask = measured.uv, measured.mask & turn.visible(measured.uv, matrix)
+    cov = measured.cov.expand(*uv.shape[:2], *measured.cov.shape[-3:])
+    cov = torch.where(mask[..., None, None], turn.covariances(cov, uv), cov)
+    turned = torch.where(mask[..., None], turn.points(uv), torch.zeros_like(uv))
+    face = measured.face
+    if face is not None:
+        sure = face.confidence * turn.visible(face.places, matrix)
+        places = torch.where(sure[..., None] > 0, turn.points(face.places), 0.0)
+        face = face._replace(places=places, confidence=sure)
+    return measured._replace(uv=turned, mask=mask, cov=cov, face=face)
+
+
 def in_prior_pixels(
     keypoints: Float[Tensor, "B T J 2"],
     confidence: Float[Tensor, "B T J"] | None,
@@ -224,7 +268,7 @@ def in_prior_pixels(
     camera: PinholeCamera,
     measurement_cov: Float[Tensor, "8 2 2"],
 ) -> MeasuredJoints:
-    """Return the eight joints among the keypoints, in the pixels of the prior's camera.
+    """Return the eight joints among the keypoints, in the pixels of the prior's camera, which is level.
 
     Args:
         keypoints, confidence, mask, covariance: as in `UpperBodyTracker.forward`.
@@ -248,6 +292,9 @@ def in_prior_pixels(
         face = measure_face(keypoints, confidence, mask, picked.face)
         face = face._replace(places=to_prior.points(face.places))
         measured = measured._replace(face=face)
+    measured = in_level_pixels(
+        measured, kept_turn(camera, prior), prior.info.matrix.to(measured.uv)
+    )
     if not picked.middle:
         return measured
     return place_measured_neck(measured, pixels_per_metre(prior))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose._core.files import atomic_path
+from torchpose.camera._tilt import level_rotation
 from torchpose.errors import InputError
 from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -77,7 +78,8 @@ def write_bvh(track: PoseTrack, path: str | Path) -> None:
     The root is the neck, since the hips are not tracked. It turns with the line of the shoulders and
     stays upright otherwise; from it come a chain to the head and one along each arm. Bones have the
     median of their lengths over the frames, in centimetres; at rest the arms point sideways (a T
-    pose) and the person faces +z, with y up. Rotations are ``Zrotation Xrotation Yrotation``.
+    pose) and the person faces +z, with y up: that of the camera, or of the world where `PoseTrack.up` is
+    known. Rotations are ``Zrotation Xrotation Yrotation``.
 
     Positions of joints do not tell how a bone is twisted about its own axis. Every bone is turned
     into its direction on the shortest way from its parent's, which leaves that twist undetermined:
@@ -91,7 +93,10 @@ def write_bvh(track: PoseTrack, path: str | Path) -> None:
     """
     if len(track) != 1:
         raise InputError(f"a BVH file holds one sequence, got {len(track)}; see PoseTrack.sequence")
-    motion = joints_to_bvh(track.joints3d[0])
+    joints = track.joints3d[0]
+    if track.up is not None and track.frame == "camera":
+        joints = joints @ level_rotation(track.up).to(joints).mT
+    motion = joints_to_bvh(joints)
     write_bvh_motion(path, _nodes(motion), motion.position, motion.angles, track.fps or _FPS)
 
 

@@ -12,6 +12,7 @@ from torchpose._core.estimates import check_estimates, check_number_range, frame
 from torchpose._core.files import write_npz
 from torchpose._core.reading import check_arrays, one_text, read_npz, texts
 from torchpose.camera._projection import check_intrinsics
+from torchpose.camera._tilt import unit_up
 from torchpose.errors import CameraError, FileFormatError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
@@ -33,7 +34,8 @@ FRAME_FIELDS = (
 """What a `PoseTrack` holds for every frame."""
 
 # Files of older releases have none of these.
-_ADDED = ("effective_sample_size", "inlier_probability", "bone_lengths", "bone_covariance")
+_ADDED = ("effective_sample_size", "inlier_probability", "bone_lengths", "bone_covariance", "up")
+_OF_CAMERA = ("K", "up")
 # Kinds and sizes in a file, of several sequences behind that of the batch.
 _FIELDS = {
     "joints2d": ("f", "T 8 2"),
@@ -49,6 +51,7 @@ _FIELDS = {
     "lengths": ("i", ""),
     "failed_at": ("i", ""),
     "K": ("f", "3 3"),
+    "up": ("f", "3"),
 }
 
 
@@ -74,6 +77,8 @@ class PoseTrack:
         names: the names of the joints. fps: the number of frames per second, or None.
         frame: the axes of the joints: "camera" (x right, y down, z forward), or "body" for those of the
             prior's recordings.
+        up: [3], the direction that points up in the axes of the camera, of length one; None where it is not
+            known, and the camera was taken to be about level.
         notes: the assumptions about camera, neck and hands, and whether covariances had to be mended,
             in plain words.
         first_frame: the frame of the video or recording that the first pose belongs to.
@@ -115,6 +120,7 @@ class PoseTrack:
     bone_lengths: Tensor = field(default_factory=lambda: torch.empty(0))
     bone_covariance: Tensor = field(default_factory=lambda: torch.empty(0))
     bone_names: tuple[str, ...] = BONE_NAMES
+    up: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.effective_sample_size.numel() == 0:
@@ -171,7 +177,8 @@ class PoseTrack:
         `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
         log_evidence_arms, effective_sample_size, inlier_probability, bone_lengths, bone_covariance,
-        bone_names, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes, first_frame, method.
+        bone_names, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes, first_frame, method;
+        up if it is known.
 
         Args:
             path: the .npz file, which is replaced if there is one.
@@ -193,6 +200,8 @@ class PoseTrack:
         arrays["names"] = np.array(self.names)
         arrays["fps"] = np.array(np.nan if self.fps is None else self.fps)
         arrays["K"] = self.matrix.detach().cpu().numpy()
+        if self.up is not None:
+            arrays["up"] = self.up.detach().cpu().numpy()
         arrays["frame"] = np.array(self.frame)
         arrays["notes"] = np.array(self.notes, dtype=str)
         arrays["first_frame"] = np.array(self.first_frame)
@@ -224,12 +233,15 @@ class PoseTrack:
         sizes = check_arrays(
             path,
             arrays,
-            {k: f"{kind} {batch * (k != 'K')}{size}" for k, (kind, size) in fields.items()},
+            {
+                k: f"{kind} {batch * (k not in _OF_CAMERA)}{size}"
+                for k, (kind, size) in fields.items()
+            },
         )
         if not all(sizes.values()):
             raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
         tensors: dict[str, Any] = {key: to_tensor(arrays[key]) for key in fields}
-        tensors = {k: v[None] if single and k != "K" else v for k, v in tensors.items()}
+        tensors = {k: v[None] if single and k not in _OF_CAMERA else v for k, v in tensors.items()}
         tensors["log_evidence"] = tensors.pop("log_evidence_arms")
         tensors["matrix"] = tensors.pop("K")
         names = texts(path, "names", arrays["names"])
@@ -256,6 +268,8 @@ class PoseTrack:
             check_intrinsics("K", self.matrix)
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from error
+        if self.up is not None:
+            self.up = unit_up(f"{path}: up", self.up)
         n_frames = self.joints3d.shape[1]
         check_number_range(path, "lengths", self.lengths, 1, n_frames)
         check_number_range(path, "failed_at", self.failed_at, -1, n_frames - 1)

@@ -30,7 +30,7 @@ from torchpose.upper_body._fusion import (
     read_out,
     recalibrated,
 )
-from torchpose.upper_body._measured_joints import kept_pixel_maps
+from torchpose.upper_body._measured_joints import kept_pixel_maps, kept_turn
 from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._screening import Screened
@@ -85,7 +85,7 @@ class PoseReader(NamedTuple):
         motion, reading = self._steadied(
             motion, read_out(estimates, matrix, self.order), estimates, lengths
         )
-        reading = self._placed(reading, matrix, found.measured.mask)
+        reading = self._tilted(self._placed(reading, matrix, found.measured.mask), matrix)
         if lengths is None:
             lengths = torch.full((len(reading.uv),), reading.uv.shape[1], device=reading.uv.device)
         else:
@@ -138,6 +138,7 @@ class PoseReader(NamedTuple):
             ),
             lengths=lengths,
             matrix=self.camera.matrix.clone(),
+            up=None if self.camera.up is None else self.camera.up.clone(),
             failed_at=first_failure(left, right),
             fps=self.fps,
             frame=self.frame,
@@ -160,6 +161,20 @@ class PoseReader(NamedTuple):
             return reading
         fixed = self.prior.left.moments()[0][18:] if self.static_camera else None
         return in_camera_axes(reading, self.order, fixed)
+
+    def _tilted(self, reading: ReadOut, matrix: Float[Tensor, "3 3"]) -> ReadOut:
+        """Return poses of the level camera in the pixels and the axes of the camera that is tilted."""
+        turn = kept_turn(self.camera, self.prior)
+        if turn is None:
+            return reading
+        back = turn.back(matrix.to(turn.rotation))
+        uv_covs = back.covariances(reading.uv_covs, reading.uv)
+        reading = reading._replace(uv=back.points(reading.uv), uv_covs=uv_covs)
+        if self.frame == "body":
+            return reading
+        rotation = back.rotation.to(reading.joints)
+        covs = rotation @ reading.covs @ rotation.mT
+        return reading._replace(joints=reading.joints @ rotation.mT, covs=covs)
 
 
 def _bone_fields(bones: Bones | None) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from torchpose.camera._projection import map_pixels
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import OTHER_SIDE
-from torchpose.upper_body._measured_joints import pixels_per_metre
+from torchpose.upper_body._measured_joints import kept_turn, pixels_per_metre
 from torchpose.upper_body._picked import Picked
 
 
@@ -125,7 +125,8 @@ def kept_screen_model(
     """
     info, joints = prior.info, tuple(i >= 0 for i in picked.indices)
     joints = tuple(given or (picked.middle and i == _NECK) for i, given in enumerate(joints))
-    sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple(), camera.matrix)
+    mixtures = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple())
+    sources = (*mixtures, camera.matrix, camera.up)
     wide = torch.zeros((), dtype=torch.float64, device=like.device)
     return derived(
         owner,
@@ -150,10 +151,7 @@ def screen_model(
             origin. fps: frames per second. joints: which of `UPPER_BODY` are among the keypoints.
         like: a tensor of the dtype and on the device to work in.
     """
-    own, wanted = camera.matrix.to(like), prior.info.matrix.to(like)
-    corners = map_pixels(
-        torch.stack([like.new_zeros(2), _image_size(camera).to(like)]), own, wanted
-    )
+    corners = _corners(prior, camera, like)
     size, middle = (corners[1] - corners[0]).abs(), corners.mean(0)
     outlier = math.log(OUTLIERS / (1 - OUTLIERS)) - float((_ENLARGED * size).log().sum())
     dt, scale = 1.0 / fps, pixels_per_metre(prior)
@@ -176,6 +174,19 @@ def screen_model(
         _subsets(joints).to(like), torch.tensor(exchanges, device=like.device),
         _switching(len(exchanges)).to(like),
     )  # fmt: skip
+
+
+def _corners(prior: UpperBodyPrior, camera: PinholeCamera, like: Tensor) -> Float[Tensor, "2 2"]:
+    """Return two opposite corners of the box, in the prior's pixels, that the image lies in."""
+    own, wanted = camera.matrix.to(like), prior.info.matrix.to(like)
+    ends = torch.stack([like.new_zeros(2), _image_size(camera).to(like)])
+    turn = kept_turn(camera, prior)
+    if turn is None:
+        return map_pixels(ends, own, wanted)
+    places = torch.cat([torch.cartesian_prod(*ends.T), ends.mean(0, keepdim=True)])
+    places = map_pixels(places, own, wanted)
+    turned = turn.points(places)[turn.visible(places, wanted)]
+    return torch.stack([turned.amin(0), turned.amax(0)])
 
 
 def _kind(name: str) -> str:

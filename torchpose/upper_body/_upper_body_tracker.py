@@ -58,6 +58,7 @@ from torchpose.upper_body._measured_joints import (
     check_sequences,
     in_prior_pixels,
     joint_covariances,
+    kept_turn,
 )
 from torchpose.upper_body._picked import Picked, pick_joints
 from torchpose.upper_body._pose_track import PoseTrack
@@ -102,8 +103,8 @@ class UpperBodyTracker(WideModule):
 
     Args:
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
-        camera: the camera that took the keypoints; by default that of the prior. Keypoints of another
-            camera than the prior's are mapped to it.
+        camera: the camera that took the keypoints. Those of another camera than the prior's are mapped to
+            it, and those of a camera that looks up or down or is rolled to a level one, if its `up` tells.
         method: the name of an estimator, one of `METHODS`. The default depends on what is measured:
             "articulated" where wrists stand for the prior's hands, or an option of bones is given, and
             neither `steady` nor an option of another method is; else "multiple-model" where the prior has
@@ -231,6 +232,7 @@ class UpperBodyTracker(WideModule):
         model = TrackerModel(
             self, self.prior, self.measurement_cov, self.fps, self.smoothing,
             calibrated=self.calibrated, steadied=not self._unsteady,
+            upright=self.camera.up is not None,
         )  # fmt: skip
         if picked is not None:
             model = model._replace(hand=picked.hand, middle=(picked.middle, picked.middle_alone))
@@ -438,7 +440,9 @@ class UpperBodyTracker(WideModule):
         hands = absent[:, :, [max(place, 0) for place in places]].to(measured.uv)
         unknown = torch.tensor([place < 0 for place in places], device=hands.device)
         hands = hands.masked_fill(unknown, torch.nan)
-        return measured._replace(absence=absence_of(hands, self.camera, self.prior.info.matrix))
+        turn = kept_turn(self.camera, self.prior)
+        absence = absence_of(hands, self.camera, self.prior.info.matrix, turn)
+        return measured._replace(absence=absence)
 
     def _screen(self, picked: Picked) -> ScreenModel | None:
         """Return the model of the outlier screening; None if keypoints are taken as they are."""

@@ -4,6 +4,7 @@ Mixtures over windows see the body through a virtual camera that follows it
 (`torchpose.camera._virtual_camera`).
 """
 
+import math
 from functools import cache
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
+from torchpose.math._rotations import RotationOrder, matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._window import WindowPrior
@@ -43,6 +45,8 @@ from torchpose.upper_body._measured_joints import (
 )
 from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
 
+_ANGLES = (15, 16)  # of a window state: roll and pitch of the camera
+_UPRIGHT = math.radians(3.0)  # standard deviation of cameras that the prior takes to be level
 _N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
 _LIMBS = ARM_JOINTS[:_N_LIMB]
 
@@ -207,7 +211,7 @@ class WindowMixture(Estimator):
     def _context(self, joints: tuple[str, ...]) -> int:
         """Return how many of the first measurements are the window's hands, and the torso if it is given."""
         torso = [joint for joint in joints if joint not in _LIMBS] if self.of_limbs else []
-        return 2 * (self.window.layout.n_hands + len(torso))
+        return 2 * (self.window.layout.n_hands + len(torso) + self.model.upright)
 
     def _outside(self, seen: SeenInView, absence: Absence, side: str) -> OutsidePoint | None:
         """Return the evidence that an arm's hand is outside of the image, if there is any in these frames."""
@@ -225,7 +229,17 @@ class WindowMixture(Estimator):
         """Return values, mask and R of the hands of the window and of some joints of an arm."""
         cov = self.model.measurement_cov
         noise = _window_noise(seen, self.window, side, joints, cov) if joints else None
-        return *_window_inputs(seen, side, joints), noise
+        values, mask = _window_inputs(seen, side, joints)
+        if not self.model.upright:
+            return values, mask, noise
+        # roll and pitch of the virtual camera are known, and bodies of the prior are upright
+        order: RotationOrder = self.model.prior.info.rotation_order  # type: ignore[assignment]
+        angles = matrix_to_euler(seen.view.rotation, order)[..., :2]
+        known = torch.ones_like(mask[..., :2])
+        if noise is not None:
+            spread = _UPRIGHT**2 * torch.eye(2).to(noise)
+            noise = _blocks(spread.expand(*noise.shape[:-2], 2, 2), noise)
+        return torch.cat([angles, values], -1), torch.cat([known, mask], -1), noise
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> FixedTrackFilter:
         """Return the filter of an arm; made once for its prior, noise and settings."""
@@ -234,9 +248,11 @@ class WindowMixture(Estimator):
         settings = (*window.settings.items(), self.power, self.dtype)
         return derived(
             self.model.owner,
-            (self.calibration, side, joints, window.layout, *settings),
+            (self.calibration, side, joints, window.layout, self.model.upright, *settings),
             (*mixture.parameters_tuple(), cov),
-            lambda: _window_filter(window, side, joints, cov, self.power, self.dtype),
+            lambda: _window_filter(
+                window, side, joints, cov, self.power, self.dtype, self.model.upright
+            ),
         )
 
 
@@ -268,17 +284,22 @@ def _window_filter(
     measurement_cov: Float[Tensor, "8 2 2"],
     likelihood_power: float,
     dtype: torch.dtype,
+    upright: bool,
 ) -> FixedTrackFilter:
-    """Return the filter of fixed tracks over windows that measures a window's hands and these joints."""
+    """Return the filter of fixed tracks over windows that measures a window's hands and these joints.
+
+    Before them it measures roll and pitch of the camera, if these are known.
+    """
     layout = window.layout
-    blocks = [_hand_cov(window, side, measurement_cov)] * layout.n_hands
+    blocks = [_UPRIGHT**2 * torch.eye(2).to(measurement_cov)] if upright else []
+    blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
     blocks += [*measurement_cov[_rows(side, joints)]]
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
     return FixedTrackFilter(
         getattr(window, side),
         torch.ones(layout.dim, dtype=torch.float64),
         torch.block_diag(*blocks),
-        list(layout.hands) + pixel_indices(joints),
+        [*(_ANGLES if upright else ()), *layout.hands, *pixel_indices(joints)],
         transition="ou",
         gamma=0.0,
         weighting="frame",
@@ -319,6 +340,14 @@ def _window_noise(
     hand = _hand_cov(window, side, measurement_cov)
     hands = hand.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
     return block_diagonal(torch.cat([hands, own], -3))
+
+
+def _blocks(first: Float[Tensor, "*batch N N"], last: Float[Tensor, "*batch M M"]) -> Tensor:
+    """Return matrices with two blocks on their diagonals."""
+    n, m = first.shape[-1], last.shape[-1]
+    return torch.nn.functional.pad(first, (0, m, 0, m)) + torch.nn.functional.pad(
+        last, (n, 0, n, 0)
+    )
 
 
 def _limbs_last(joints: tuple[str, ...]) -> tuple[str, ...]:

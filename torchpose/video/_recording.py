@@ -275,6 +275,7 @@ def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
         log_evidence=torch.zeros(1, n_frames, 2, dtype=torch.float64),
         lengths=torch.tensor([n_frames]),
         matrix=tracker.camera.matrix,
+        up=tracker.camera.up,
         failed_at=torch.tensor([-1]),
         fps=tracker.fps,
         frame=tracker.frame,
