@@ -51,13 +51,13 @@ def main(
         data: folder with the sets.
         threads: cores.
         out: file for the same as Markdown, or a folder.
-        quick: few recordings and two tilts, with the priors that come with torchpose.
+        quick: few recordings and one tilt, with the priors that come with torchpose.
     """
     torch.set_num_threads(threads)
     prior = torchpose.load_prior("kinect-upper-body-small" if quick else "kinect-upper-body")
     arms = shipped_arm_prior() if quick else bones.fit_without(data, "mocap_berkeley_mhad")
     report = Report("Cameras that look up or down")
-    for pitch in PITCHES[2:4] if quick else PITCHES:
+    for pitch in PITCHES[3:4] if quick else PITCHES:
         views = bones.mhad_views(data, 150 if quick else _EVERY, math.radians(pitch))
         views = [bones.begun(view, 10 if quick else _FRAMES) for view in views]
         title = f"{pitch:+.0f} degrees" if pitch else "level"

@@ -93,7 +93,7 @@ def test_a_camera_of_a_rig_says_by_its_rotation_where_up_is():
     rotation = [math.radians(90 - 20), 0.0, 0.0]  # of a world with z up: forward, and 20 degrees up
     camera = PinholeCamera(525, 525, 320, 240, rotation=rotation).with_world_up("z")
     pitch, roll = angles_of_up(camera.up)
-    assert abs(math.degrees(pitch)) == pytest.approx(20) and roll == pytest.approx(0)
+    assert math.degrees(pitch) == pytest.approx(20) and roll == pytest.approx(0)
     torch.testing.assert_close(camera.up, camera.rotation_matrix[:, 2])
     assert camera.rotation.tolist() == rotation
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -92,6 +93,24 @@ def test_table_holds_the_same(track, tmp_path):
     assert len(rows[0]) == 2 + 8 * len(columns) + 1
     read = [float(r["log_evidence"]) for r in rows]
     np.testing.assert_allclose(read, poses.log_evidence[0].sum(-1), atol=6e-7)
+
+
+def test_a_tilt_is_told_by_degrees_a_file_or_the_axis_that_points_up(track, files, tmp_path):
+    clip = read_keypoints(files / "keypoints.npz")
+    camera = PinholeCamera.from_matrix(clip.K)
+    tilted = camera.tilted(math.radians(-15), math.radians(4))
+    done, poses = track("--tilt=-15", "--roll", "4")
+    assert "looking down by 15 degrees and rolled by 4 degrees" in done.out
+    wanted = expected(files, camera=tilted)
+    same(poses, wanted)
+    torch.testing.assert_close(poses.up, tilted.up)
+    save_cameras([tilted], tmp_path / "up.toml")
+    same(track("--camera", tmp_path / "up.toml")[1], wanted)
+    fx, fy, cx, cy = (float(clip.K[row]) for row in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    forward = (math.pi / 2 + 0.2, 0.0, 0.0)  # in a world with z up: along y, and down by 0.2
+    save_cameras([PinholeCamera(fx, fy, cx, cy, rotation=forward)], tmp_path / "rig.toml")
+    _, poses = track("--camera", tmp_path / "rig.toml", "--up", "z")
+    torch.testing.assert_close(poses.joints3d, expected(files, camera=camera.tilted(-0.2)).joints3d)
 
 
 def test_pictures(torchpose, files, tmp_path):
@@ -377,6 +396,9 @@ BAD_INPUT = {
     "a camera in millimetres": ([CLIP, "--camera", "4.2,4.2,3,2"], "a camera must be in pixels"),
     "no camera file": ([CLIP, "--camera", "{tmp}/no.toml"], "no such file"),
     "camera of other images": ([CLIP, "--camera", "{tmp}/wide.toml"], "640 x 360"),
+    "a tilt of a camera overhead": ([CLIP, "--tilt=-80"], "looks down by 80 degrees"),
+    "a tilt and an axis": ([CLIP, "--tilt", "5", "--up", "z"], "give one of them"),
+    "an axis alone": ([CLIP, "--up", "z"], "needs --camera FILE"),
     "a camera's name alone": (
         [CLIP, "--camera-name", "left"],
         "one of several cameras of --camera",

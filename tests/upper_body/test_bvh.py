@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.upper_body.bvh_reader import pose, read_bvh
+from torchpose import PinholeCamera
 from torchpose.demo import performer
 from torchpose.errors import InputError, OutputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
@@ -47,6 +48,18 @@ def test_a_body_of_fixed_bones_comes_back_exactly(tmp_path):
     back = read_joints(tmp_path / "poses.bvh", frames)
     # six decimals of degrees over a chain of 80 cm
     assert np.abs(back - joints[list(frames)].numpy()).max() < 1e-7
+
+
+def test_poses_of_a_tilted_camera_are_written_upright(tmp_path):
+    camera = PinholeCamera(525, 525, 320, 240).tilted(0.4, 0.1)
+    joints = performer(n_frames=30).joints
+    tilted = replace(track_of(joints @ camera.level_rotation), up=camera.up)
+    write_bvh(tilted, tmp_path / "poses.bvh")
+    back = read_joints(tmp_path / "poses.bvh", range(30))
+    assert np.abs(back - joints.numpy()).max() < 1e-7
+    write_bvh(replace(tilted, frame="body"), tmp_path / "body.bvh")
+    back = read_joints(tmp_path / "body.bvh", range(30))
+    assert np.abs(back - tilted.joints3d[0].numpy()).max() < 1e-7
 
 
 def test_other_bodies_come_back_within_the_variation_of_their_bones(tmp_path):
