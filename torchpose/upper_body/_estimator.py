@@ -38,8 +38,8 @@ class TrackerModel(NamedTuple):
             shoulders their middle alone is measured.
         calibrated: whether covariances are recalibrated by the noise of the prior.
         steadied: whether the poses of windows pass filters of constant velocity.
-        upright: whether the camera's orientation against gravity is known, and measurements are those of a
-            level camera; else it is about level.
+        pitch: the angle by which the camera looks up, radians, if its orientation against gravity is known;
+            measurements are then those of a level camera. None is about level.
     """
 
     owner: nn.Module
@@ -51,7 +51,13 @@ class TrackerModel(NamedTuple):
     middle: tuple[bool, bool] = (False, False)
     calibrated: bool = True
     steadied: bool = True
-    upright: bool = False
+    pitch: float | None = None
+
+    @property
+    def upright(self) -> bool:
+        """Return whether roll and pitch of the camera against gravity are known, as angles of a state."""
+        # with yaw the last rotation, they do not depend on the turn of the body
+        return self.pitch is not None and self.prior.info.rotation_order == "zxy"
 
     @property
     def rate(self) -> float:

@@ -23,7 +23,11 @@ from torchpose.upper_body._face_points import FacePoints, measure_face
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
 
+CAMERA_ANGLES = (15, 16)
+"""Dimensions of an arm's state that are roll and pitch of the camera, in both orders of rotations."""
+
 _DEFAULT_STD = 3.0  # pixels
+_UPRIGHT_STD = math.radians(3.0)  # of cameras that a prior takes to be level
 _LEAST_CONFIDENCE = 0.05
 # Metres of the neck above the middle of the shoulders where there is no head, and their spread.
 _NECK_HEIGHT, _NECK_SPREAD = 0.105, 0.035
@@ -417,6 +421,11 @@ def joint_covariances(
     if learnt is None:
         cov = map_pixel_covariance(cov, matrix, prior.info.matrix)
     return cov[[ARM_JOINTS.index(joint.split("_")[0]) for joint in UPPER_BODY]]
+
+
+def upright_cov() -> Float[Tensor, "2 2"]:
+    """Return R of roll and pitch of a camera whose orientation against gravity is known, radians squared."""
+    return _UPRIGHT_STD**2 * torch.eye(2, dtype=torch.float64)
 
 
 def pixel_indices(joints: Sequence[str]) -> list[int]:

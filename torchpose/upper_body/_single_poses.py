@@ -12,6 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.module_state import derived
+from torchpose.camera._tilt import Turn, up_of_angles
+from torchpose.camera._virtual_camera import BodyView
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
@@ -30,7 +32,13 @@ from torchpose.upper_body._estimator import (
     in_double,
     require_cov,
 )
-from torchpose.upper_body._measured_joints import MeasuredJoints, arm_measurements, pixel_indices
+from torchpose.upper_body._measured_joints import (
+    CAMERA_ANGLES,
+    MeasuredJoints,
+    arm_measurements,
+    pixel_indices,
+    upright_cov,
+)
 
 _WALK_RATE = 0.9  # of a component's covariance, per second; chosen as the methods' factors were
 
@@ -245,18 +253,22 @@ class SinglePoses(Estimator):
         info = prior.info
         return derived(
             self.model.owner,
-            (side, joints, info.fps, info.transition, info.fx, info.fy),
+            (side, joints, info.fps, info.transition, info.fx, info.fy, self.model.upright),
             (*mixture.parameters_tuple(), *prior.noise.values(), cov, *tensors),
             lambda: self._make(side, joints),
         )
 
     def _make(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
         prior, arm = self.model.prior, ARMS[side]
-        blocks = [self.model.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+        cov = self.model.measurement_cov
+        blocks = [cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+        observed = pixel_indices(joints)
+        if self.model.upright:
+            blocks, observed = [*blocks, upright_cov().to(cov)], [*observed, *CAMERA_ANGLES]
         return self.method.filter(
             getattr(prior, side),
             measurement_cov=torch.block_diag(*blocks),
-            observed=pixel_indices(joints),
+            observed=observed,
             **self.method.settings,
             **self.method.arguments(prior, side, self.model.fps, self.options),
         )
@@ -279,19 +291,20 @@ class SinglePoses(Estimator):
     ) -> tuple[PoseState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         filters, arms = {}, {}
+        measured, view = self._see(measured)
         for side, arm in ARMS.items():
             joints = state.joints[side]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
                 filters[side], out = self.filter(side, joints).advance(
                     state.filters[side],
-                    *arm_measurements(arm, joints, measured),
+                    *self._given(arm, joints, measured),
                     generator=state.generators[side],
                     return_cov=True,
                     progress=progress,
                 )
             arms[side] = _wide(out)
-        return state._replace(filters=filters), Estimates(arms["left"], arms["right"])
+        return state._replace(filters=filters), Estimates(arms["left"], arms["right"], view)
 
     def forward(
         self,
@@ -307,9 +320,10 @@ class SinglePoses(Estimator):
         covariances the sequences share. Smoothing takes all frames at once and shows no bar.
         """
         smoothing, arms = self.model.smoothing, {}
+        measured, view = self._see(measured)
         for side, arm in ARMS.items():
             model = self.filter(side, joints[side])
-            z, mask, cov = arm_measurements(arm, joints[side], measured)
+            z, mask, cov = self._given(arm, joints[side], measured)
             if smoothing is None:
                 own = arm_generators[side]
                 out = model(
@@ -320,7 +334,44 @@ class SinglePoses(Estimator):
                 smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
                 out = smooth(z, mask, cov, lengths=lengths, lag=lag, return_cov=True)
             arms[side] = in_double(out)
-        return Estimates(arms["left"], arms["right"])
+        return Estimates(arms["left"], arms["right"], view)
+
+    def _see(self, measured: MeasuredJoints) -> tuple[MeasuredJoints, BodyView | None]:
+        """Return measurements as the camera has them but for its roll, where bodies are as in the prior.
+
+        In the level camera a body that is seen from above is far below the prior's bodies.
+        """
+        if not self.model.upright:
+            return measured, None
+        matrix = self.model.prior.info.matrix.to(measured.uv)
+        up = matrix.new_tensor(up_of_angles(self.model.pitch or 0.0))
+        turn = Turn.to_level(up, matrix).back(matrix)
+        uv, cov = turn.points(measured.uv), turn.covariances(measured.cov, measured.uv)
+        there = measured.mask[..., None]
+        uv = torch.where(there, uv, torch.zeros_like(uv))
+        cov = torch.where(there[..., None], cov, self.model.measurement_cov)
+        ones = torch.ones_like(uv[..., 0, 0])
+        rotation = turn.rotation.expand(*ones.shape, 3, 3)
+        return measured._replace(uv=uv, cov=cov), BodyView(
+            rotation, ones, torch.zeros_like(uv[..., 0, :])
+        )
+
+    def _given(
+        self, arm: tuple[int, ...], joints: tuple[str, ...], measured: MeasuredJoints
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what an arm's filter measures: its joints, then roll and pitch of the camera if known."""
+        z, mask, cov = arm_measurements(arm, joints, measured)
+        if not self.model.upright:
+            return z, mask, cov
+        angles = torch.zeros_like(z[..., :2])
+        angles[..., 1] = -(self.model.pitch or 0.0)  # about the axis to the right, which looks down
+        n = cov.shape[-1]
+        noise = torch.nn.functional.pad(upright_cov().to(cov), (n, 0, n, 0))
+        return (
+            torch.cat([z, angles], -1),
+            torch.cat([mask, torch.ones_like(mask[..., :2])], -1),
+            torch.nn.functional.pad(cov, (0, 2, 0, 2)) + noise,
+        )
 
 
 def _wide(out: FilterOutput) -> FilterOutput:

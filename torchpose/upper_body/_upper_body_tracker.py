@@ -23,6 +23,7 @@ from torchpose._core.module_state import (
     working_precision,
 )
 from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._tilt import angles_of_up
 from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -232,7 +233,7 @@ class UpperBodyTracker(WideModule):
         model = TrackerModel(
             self, self.prior, self.measurement_cov, self.fps, self.smoothing,
             calibrated=self.calibrated, steadied=not self._unsteady,
-            upright=self.camera.up is not None,
+            pitch=None if self.camera.up is None else angles_of_up(self.camera.up)[0],
         )  # fmt: skip
         if picked is not None:
             model = model._replace(hand=picked.hand, middle=(picked.middle, picked.middle_alone))

@@ -4,7 +4,6 @@ Mixtures over windows see the body through a virtual camera that follows it
 (`torchpose.camera._virtual_camera`).
 """
 
-import math
 from functools import cache
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
-from torchpose.math._rotations import RotationOrder, matrix_to_euler
+from torchpose.math._rotations import matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._window import WindowPrior
@@ -39,14 +38,14 @@ from torchpose.upper_body._estimator import (
     require_cov,
 )
 from torchpose.upper_body._measured_joints import (
+    CAMERA_ANGLES,
     MeasuredJoints,
     block_diagonal,
     pixel_indices,
+    upright_cov,
 )
 from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
 
-_ANGLES = (15, 16)  # of a window state: roll and pitch of the camera
-_UPRIGHT = math.radians(3.0)  # standard deviation of cameras that the prior takes to be level
 _N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
 _LIMBS = ARM_JOINTS[:_N_LIMB]
 
@@ -233,11 +232,10 @@ class WindowMixture(Estimator):
         if not self.model.upright:
             return values, mask, noise
         # roll and pitch of the virtual camera are known, and bodies of the prior are upright
-        order: RotationOrder = self.model.prior.info.rotation_order  # type: ignore[assignment]
-        angles = matrix_to_euler(seen.view.rotation, order)[..., :2]
+        angles = matrix_to_euler(seen.view.rotation, "zxy")[..., :2]
         known = torch.ones_like(mask[..., :2])
         if noise is not None:
-            spread = _UPRIGHT**2 * torch.eye(2).to(noise)
+            spread = upright_cov().to(noise)
             noise = _blocks(spread.expand(*noise.shape[:-2], 2, 2), noise)
         return torch.cat([angles, values], -1), torch.cat([known, mask], -1), noise
 
@@ -246,13 +244,12 @@ class WindowMixture(Estimator):
         window, cov = self.window, self.model.measurement_cov
         mixture: GaussianMixture = getattr(window, side)
         settings = (*window.settings.items(), self.power, self.dtype)
+        upright = self.model.upright
         return derived(
             self.model.owner,
-            (self.calibration, side, joints, window.layout, self.model.upright, *settings),
+            (self.calibration, side, joints, window.layout, upright, *settings),
             (*mixture.parameters_tuple(), cov),
-            lambda: _window_filter(
-                window, side, joints, cov, self.power, self.dtype, self.model.upright
-            ),
+            lambda: _window_filter(window, side, joints, cov, self.power, self.dtype, upright),
         )
 
 
@@ -291,7 +288,7 @@ def _window_filter(
     Before them it measures roll and pitch of the camera, if these are known.
     """
     layout = window.layout
-    blocks = [_UPRIGHT**2 * torch.eye(2).to(measurement_cov)] if upright else []
+    blocks = [upright_cov().to(measurement_cov)] if upright else []
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
     blocks += [*measurement_cov[_rows(side, joints)]]
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
@@ -299,7 +296,7 @@ def _window_filter(
         getattr(window, side),
         torch.ones(layout.dim, dtype=torch.float64),
         torch.block_diag(*blocks),
-        [*(_ANGLES if upright else ()), *layout.hands, *pixel_indices(joints)],
+        [*(CAMERA_ANGLES if upright else ()), *layout.hands, *pixel_indices(joints)],
         transition="ou",
         gamma=0.0,
         weighting="frame",
