@@ -59,7 +59,7 @@ def main(
     report = Report("Cameras that look up or down")
     for pitch in PITCHES[3:4] if quick else PITCHES:
         views = bones.mhad_views(data, 150 if quick else _EVERY, math.radians(pitch))
-        views = [bones.begun(view, 10 if quick else _FRAMES) for view in views]
+        views = [bones.begun(view, 4 if quick else _FRAMES) for view in views]
         title = f"{pitch:+.0f} degrees" if pitch else "level"
         table = report.table(title, title, _COLUMNS, digits=_DIGITS)
         for name, scores in _scores(views, pitch, prior, {"arms": arms}).items():
