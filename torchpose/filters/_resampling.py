@@ -252,14 +252,16 @@ def _solve(relative: Tensor, alive: Tensor, start: Tensor, target: float) -> Ten
         scaled = torch.where(alive, beta[..., None] * relative, -torch.inf)
         once, twice = torch.logsumexp(scaled, -1), torch.logsumexp(2 * scaled, -1)
         value = 2 * once - twice - target
-        if bool((value.abs() < _TOLERANCE).all()):
+        done = value.abs() < _TOLERANCE
+        if bool(done.all()):
             break
         low, high = torch.where(value > 0, u, low), torch.where(value > 0, high, u)
         gap = (scaled - once[..., None]).exp() - (2 * scaled - twice[..., None]).exp()
         slope = 2 * beta * (gap * relative).sum(-1)
         newton = u - value / slope
         inside = (newton > low) & (newton < high)
-        u = torch.where(inside, newton, (low + high) / 2)
+        # what is found stays: it must not depend on how long others in the batch take
+        u = torch.where(done, u, torch.where(inside, newton, (low + high) / 2))
     return u
 
 
