@@ -14,8 +14,14 @@ from torchpose.math._unscented import sigma_points
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import RootUncertaintyTracker, render
 from torchpose.whole_body._filters.legs import exchange_legs
-from torchpose.whole_body._filters.limb_observations import count_positions, part_log_likelihood
+from torchpose.whole_body._filters.limb_observations import (
+    count_positions,
+    least_part_log_likelihood,
+    part_log_likelihood,
+    parts_log_weight,
+)
 from torchpose.whole_body._filters.root_uncertainty import PUBLISHED
+from torchpose.whole_body._silhouettes.limb_counts import PartCounts
 from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes
 
 FRAMES = 8
@@ -188,6 +194,40 @@ def test_hypotheses_that_all_die_are_spread_anew():
         after, out = filter_.step(filter_.init(truth[:1]), elsewhere, rig(), generator=seeded(0))
     assert bool(out.respread) and torch.equal(out.mean, truth[:1])
     torch.testing.assert_close(after.memory, filter_.first_memory(after.particles))
+
+
+def test_hidden_parts_rule_no_hypothesis_out():
+    body, _, truth, silhouettes = scene()
+    shanks = [body.skeleton.names.index(f"{side}_ankle") for side in ("left", "right")]
+    others = [joint for joint in range(len(body.skeleton.names)) if joint not in shanks]
+    knees = [body.skeleton.names.index(f"{side}_knee") for side in ("left", "right")]
+    pixels = rig()(body.joints(truth)).pixels  # [T, C, J, 2]
+    hidden = silhouettes.clone()
+    for t, c in ((t, c) for t in range(FRAMES) for c in range(len(rig()))):
+        hidden[t, c, int(pixels[t, c, knees, 1].min()) - 4 :] = False  # behind a table
+    filter_ = tracker(40)
+    track = filter_(hidden, rig(), truth[0], generator=seeded(0)[0])
+    assert not bool(track.respread.any())
+    found, true = body.joints(track.mean)[:, others], body.joints(truth)[:, others]
+    assert float((found - true).norm(dim=-1).mean()) < 0.1
+
+
+def test_a_part_that_is_not_seen_weighs_as_a_hundredth_of_its_pixels():
+    area = torch.full((1, 2, 7, 3), 50)
+    weight = torch.full((1, 2, 7, 3), 25.0, dtype=torch.float64)
+    weight[:, 1] = 0
+    for rule, normalisation, least in (
+        ("product", "share", 0.01**3), ("product", "published", 0.5**3), ("sum", "share", 0.03),
+    ):  # fmt: skip
+        rules = {"cameras": rule, "normalisation": normalisation}
+        counts = PartCounts(weight, area)
+        value = part_log_likelihood(counts, **rules)
+        found = parts_log_weight(value, least_part_log_likelihood(counts, **rules))
+        expected = value[:, 0].logsumexp(-1) + math.log(7 * least)
+        torch.testing.assert_close(found, expected)
+        nothing = PartCounts(0 * weight, area)
+        value = part_log_likelihood(nothing, **rules)
+        assert bool(parts_log_weight(value, least_part_log_likelihood(nothing, **rules)).isneginf())
 
 
 def test_hypotheses_outside_the_limits_are_discarded():

@@ -183,6 +183,39 @@ def part_log_likelihood(
     return sharpness * value
 
 
+def least_part_log_likelihood(
+    counts: PartCounts, *, normalisation: str = "published", cameras: str = "product"
+) -> Float[Tensor, "*batch V S"]:
+    """Return log p(O_i | sigma_s) of places with a hundredth of their pixels in the silhouettes.
+
+    Args:
+        counts: [..., V, S, C], of which the areas count. normalisation, cameras: as `part_log_likelihood`.
+    """
+    least = PartCounts(_LEAST_SHARE * counts.area.clamp_min(1).double(), counts.area)
+    return part_log_likelihood(least, normalisation=normalisation, cameras=cameras)
+
+
+def parts_log_weight(
+    log_likelihood: Float[Tensor, "*batch V S"], least: Float[Tensor, "*batch V S"]
+) -> Float[Tensor, "*batch"]:
+    """Return the log-weight of hypotheses before annealing, sum_i log sum_j p(O_i | sigma_ij)   (DX 12).
+
+    A part that is seen at none of its places may be hidden, behind a table or beyond the image. As printed
+    it would rule its hypothesis out, and soon all of them; it has its least likelihood instead. A hypothesis
+    of which nothing is seen is ruled out.
+
+    Args:
+        log_likelihood: of `part_log_likelihood`. least: of `least_part_log_likelihood`.
+
+    Returns:
+        [...], float64, -inf where no part is seen at any place.
+    """
+    parts = log_likelihood.logsumexp(-1)
+    hidden = parts.isneginf()
+    hidden = hidden & ~hidden.all(-1, keepdim=True)
+    return torch.where(hidden, least.logsumexp(-1), parts).sum(-1)
+
+
 def observation_gaussians(
     points: Float[Tensor, "*batch V S 3"],
     log_weights: Float[Tensor, "*batch V S"],

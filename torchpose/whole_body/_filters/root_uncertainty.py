@@ -46,9 +46,11 @@ from torchpose.whole_body._filters.legs import leg_permutation
 from torchpose.whole_body._filters.limb_observations import (
     check_rules,
     count_positions,
+    least_part_log_likelihood,
     observation_gaussians,
     part_groups,
     part_log_likelihood,
+    parts_log_weight,
 )
 from torchpose.whole_body._filters.motion import default_step_std
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
@@ -83,6 +85,8 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         w_n ~ (prod_i sum_{j=1}^7 p(O_i | sigma_ij))^beta   (DX 12),
 
     with beta such that the share alpha of them survives, as published alpha = exp(ln alpha_c / fps).
+    A part under which no camera sees any silhouette, at none of its seven points, may be hidden or out of
+    view: a hundredth of its pixels counts there, unless that is so of all parts of the hypothesis.
 
     The particles of the state are the roots with the parts' means, its `memory` the covariances
     [B, N, P - 1, 3, 3]. The weights are no posterior's, so the log-evidence is NaN; the standard
@@ -335,7 +339,9 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         )
         sharp = self.observation_sharpness * likelihood
         observed = observation_gaussians(points, sharp, mean, covariance, self.least_std)
-        value = likelihood.logsumexp(-1).sum(-1)
+        value = parts_log_weight(likelihood, least_part_log_likelihood(
+            counts, normalisation=self.normalisation, cameras=self.camera_rule
+        ))  # fmt: skip
         if frame.outlined is not None:
             value = torch.where(frame.outlined[:, None], value, 0.0)
         return value, *observed
