@@ -153,6 +153,7 @@ def test_persons_held_out_give_a_manifold_its_noise(torchpose, walks, tmp_path):
     card = out.with_suffix(".md").read_text()
     assert card.startswith("# walk\n") and "2: p0, p1" in card and "set#p2" in card
     assert "--held-out p2" in card and "--out walk.safetensors " in card
+    assert "cam2.mp4 --manifold walk.safetensors --out" in card  # "walk" is the one of the package
 
 
 def test_a_fit_that_was_killed_goes_on_to_the_same_result(torchpose, walks, tmp_path, monkeypatch):
@@ -214,6 +215,7 @@ def test_the_motion_of_bodies_says_how_others_move(torchpose, walks, tmp_path):
     assert told["frames"] == 60 and 0.3 < told["acceleration"] < 0.7
     card = out.with_suffix(".md").read_text()
     assert card.startswith("# body\n") and "2: p0, p1" in card and "acceleration_scale 2" in card
+    assert "--motion body.safetensors --out" in card
     said = torchpose("info", out).out
     for part in (
         "left_shank about x: ",

@@ -125,6 +125,7 @@ def test_config(torchpose, files, tmp_path):
     "name, message",
     [
         ("nothing", "expected the name of a prior"),
+        ("nothing.safetensors", "of whole bodies (exercises, walk, whole-body), or a file, got"),
         ("other.npz", "got the keys a"),
         ("cut.npz", "truncated"),
         ("text.csv", "text.csv"),

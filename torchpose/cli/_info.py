@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchpose.cli._command import Command
-from torchpose.errors import InputError
+from torchpose.errors import InputError, PriorError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -78,7 +78,9 @@ def _describe(what: str) -> str:
         tables = [_table(describe(file)) for describe, file in found if describe is not None]
         if tables:
             return "\n\n".join(tables)
-    if what in known_priors() or path.suffix == ".safetensors" or not os.path.exists(path):
+    if what not in known_priors() and not os.path.exists(path):
+        raise _nothing_found(what)
+    if what in known_priors() or path.suffix == ".safetensors":
         return describe_prior(load_prior(what))
     if path.suffix == ".toml":
         return _describe_cameras(path)
@@ -93,6 +95,19 @@ def _describe(what: str) -> str:
     from torchpose.io._keypoints import read_keypoints
 
     return describe_keypoints(read_keypoints(path))
+
+
+def _nothing_found(what: str) -> PriorError:
+    """Return the error of what is no file and no name."""
+    from torchpose.priors._shipped import KINDS, known_models
+    from torchpose.priors._upper_body_prior import known_priors
+
+    priors = ", ".join(known_priors()) or "none in this installation"
+    models = ", ".join(sorted({name for kind in KINDS for name in known_models(kind)})) or "none"
+    return PriorError(
+        f"expected the name of a prior ({priors}) or of a model of whole bodies ({models}), or a file, got "
+        f"{what!r}, which is none of them"
+    )
 
 
 def _models_of(name: str) -> list[Path]:

@@ -118,7 +118,7 @@ def write_manifold_files(
         return plot_manifold(manifold, {"held out": list(fitting.data.watched)[:1]})
 
     pictures = {f"{Path(file).stem}.png": draw} if picture else None
-    written = write_fit(manifold, body_card(manifold), results, file, pictures)
+    written = write_fit(manifold, body_card(manifold, file=file), results, file, pictures)
     return f"{fitting.summary(manifold)}\n{_written(results, written)}"
 
 
@@ -132,7 +132,7 @@ def write_limb_files(
         least_std: see `fit_limbs`. facts: name, licence, command.
     """
     found, held_out = fit_limbs(states, least_std, **facts)
-    written = write_fit(found, body_card(found), results, file)
+    written = write_fit(found, body_card(found, file=file), results, file)
     return f"{summary(found, held_out)}\n{_written(results, written)}"
 
 
@@ -150,7 +150,7 @@ def write_body_files(
         facts: name, licence, command.
     """
     found, held_out = fit_motion(recorded, recipe, **facts)
-    written = write_fit(found, body_card(found), results, file)
+    written = write_fit(found, body_card(found, file=file), results, file)
     return f"{motion_summary(found, held_out)}\n{_written(results, written)}"
 
 
@@ -174,7 +174,8 @@ def write_action_files(
     several = len(fitted.spaces) > 1
     names = {f"{stem}-{a}.png" if several else f"{stem}.png": a for a in fitted.spaces}
     pictures = {name: drawing(action) for name, action in names.items()} if picture else None
-    written = write_fit(found, body_card(found, facts.get("name", "")), results, file, pictures)
+    card = body_card(found, facts.get("name", ""), file=file)
+    written = write_fit(found, card, results, file, pictures)
     return f"{fitted.summary()}\n{_written(results, written)}"
 
 

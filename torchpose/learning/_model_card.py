@@ -235,7 +235,9 @@ _LIMITS = (
 )
 
 
-def body_card(model: BodyModel, name: str = "", results: str = "", chosen: str = "") -> str:
+def body_card(
+    model: BodyModel, name: str = "", results: str = "", chosen: str = "", file: str = ""
+) -> str:
     """Return Markdown text on what a model is, what it was fitted to, and what it is not good for.
 
     Args:
@@ -243,9 +245,12 @@ def body_card(model: BodyModel, name: str = "", results: str = "", chosen: str =
         name: of the model, where its file does not say. results: what it scored on persons whom it was
             not fitted on, as Markdown.
         chosen: how settings were chosen, as Markdown.
+        file: name of the model's file, by which it is used; of a model of the package its name is enough.
     """
     describe = next(text for kind, text in _DESCRIBED.items() if isinstance(model, kind))
-    what, rows, held_out, use, limits = describe(model)
+    what, rows, held_out, use, limits = describe(
+        model, file or getattr(model.info, "name", "") or "FILE"
+    )
     sections = {
         "What it is": what,
         "Fitted on": card_table({**_body_data(model.info), **rows}),
@@ -265,7 +270,7 @@ def _tracking(options: str) -> str:
     return f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {options} --out result\n```"
 
 
-def _manifold(manifold: Any) -> _Told:
+def _manifold(manifold: Any, call: str) -> _Told:
     info, extra = manifold.info, manifold.info.extra
     n_frames, n_columns = manifold.poses.shape
     what = (
@@ -286,10 +291,10 @@ def _manifold(manifold: Any) -> _Told:
         "It knows one motion. Somebody who does anything else is pulled towards it, and poses that are "
         "not of the motion come out wrong."
     )
-    return what, rows, held_out, _tracking(f"--manifold {_call(info.name)}"), limits
+    return what, rows, held_out, _tracking(f"--manifold {call}"), limits
 
 
-def _limbs(limbs: Any) -> _Told:
+def _limbs(limbs: Any, call: str) -> _Told:
     info, found = limbs.info, limbs.info.extra.get("held_out")
     what = (
         f"Gaussians over the rotations between {len(limbs.edges)} pairs of connected parts, and over "
@@ -308,16 +313,10 @@ def _limbs(limbs: Any) -> _Told:
         "It knows how these persons moved in these actions; limbs in other positions or faster ones are "
         "followed late or not at all."
     )
-    return (
-        what,
-        rows,
-        held_out,
-        _tracking(f"--method root --conditionals {_call(info.name)}"),
-        limits,
-    )
+    return what, rows, held_out, _tracking(f"--method root --conditionals {call}"), limits
 
 
-def _action(space: Any) -> _Told:
+def _action(space: Any, call: str) -> _Told:
     info, accepted = space.info, space.info.extra.get("accepted")
     what = (
         f"{space.n_postures} postures of one action in {space.n_dimensions} dimensions, around which the "
@@ -326,16 +325,10 @@ def _action(space: Any) -> _Told:
     held_out = _gates({info.name: accepted} if accepted is not None else {})
     rows = {"performances": info.performances, "frame rate": _rate(info.fps)}
     limits = "Somebody who does anything else is held in the postures of this action."
-    return (
-        what,
-        rows,
-        held_out,
-        _tracking(f"--method constrained --action {_call(info.name)}"),
-        limits,
-    )
+    return what, rows, held_out, _tracking(f"--method constrained --action {call}"), limits
 
 
-def _bank(bank: Any) -> _Told:
+def _bank(bank: Any, call: str) -> _Told:
     info = bank.info
     what = (
         f"Postures of {len(info.names)} actions, {_listed(info.names)}, and one state for none of them. The "
@@ -346,11 +339,11 @@ def _bank(bank: Any) -> _Told:
         "It knows these actions; what is done otherwise is taken for one of them or for none, when the "
         "constraint is released."
     )
-    use = _tracking(f"--method constrained --action {_call(info.name)}")
+    use = _tracking(f"--method constrained --action {call}")
     return what, rows, _gates(info.extra.get("accepted", {})), use, limits
 
 
-def _body_motion(motion: Any) -> _Told:
+def _body_motion(motion: Any, call: str) -> _Told:
     info, found = motion.info, motion.info.extra.get("held_out")
     settings = info.extra.get("settings", {})
     n_poses = len(motion.poses.weights)
@@ -380,6 +373,11 @@ def _body_motion(motion: Any) -> _Told:
         "unlike theirs are taken for others where cameras see little."
     )
     use = '`BodyTracker(..., method="kalman")` uses the one that comes with the package, "whole-body".'
+    if call.endswith(".safetensors"):
+        use = (
+            f"```console\n$ torchpose track-body cameras.toml cam1.npz cam2.npz --motion {call} --out result"
+            f"\n```\n\nWithout it, {use[0].lower() + use[1:]}"
+        )
     return what, rows, held_out, use, limits
 
 
@@ -414,10 +412,6 @@ def _body_data(info: Any) -> dict[str, Any]:
 
 def _rate(fps: float | None) -> str:
     return "" if fps is None else f"{fps:g} per second"
-
-
-def _call(name: str) -> str:
-    return name or "FILE"
 
 
 def _listed(items: Iterable[str]) -> str:
