@@ -215,6 +215,10 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
         (["--height", "182"], "--height must lie between 0.5 and 2.6 m"),
         (["--camera-names", "[front,left]"], "a camera for each of the 3 inputs"),
         (["--facing", "[1,0]"], "three numbers"),
+        (["--facing", "[1,0,0]", "--initial-pose", "a.npz"], "does nothing with --initial-pose"),
+        (["--sharpness", "9"], "does nothing for --method apf on silhouettes alone"),
+        (["--delays", "[0,0,8]"], "got 8 for"),
+        (["--delays", "[-1,0,0]"], "got -1 for"),
     ],
 )
 def test_bad_options_are_refused(recorded, tmp_path, capsys, more, said):

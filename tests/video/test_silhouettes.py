@@ -163,8 +163,10 @@ def test_bad_input_is_refused():
     with pytest.raises(InputError, match="empty scene"):
         SilhouetteMeasurer(view)
     measurer = SilhouetteMeasurer(view, empty=[background])
-    with pytest.raises(InputError, match="'left' must have 320 x 240"):
+    with pytest.raises(InputError, match=r"^frames of camera 'left' must have 320 x 240"):
         measurer(background[:100])
+    with pytest.raises(InputError, match=r"^pictures of the empty scene of camera 'left' must have"):
+        SilhouetteMeasurer(view, empty=[background[:100]])
     with pytest.raises(InputError, match="frame rate"):
         list(read_silhouettes([Frames([background]), Frames([background], 25.0)], [measurer] * 2))
     with pytest.raises(InputError, match="as many"):

@@ -185,6 +185,17 @@ def test_what_does_not_go_together_is_refused(method, options, said):
         BodyTracker(rig()).init()
 
 
+def test_a_direction_that_does_nothing_is_refused(scene):
+    states, silhouettes = scene
+    facing = torch.tensor([0.0, 0.0, 1.0])
+    tracker = BodyTracker(rig(), "sir", body=walker(), n_particles=30)
+    for run in (tracker, tracker.init):
+        with pytest.raises(InputError, match="facing does nothing beside an initial_state"):
+            run(silhouettes, states[0], facing=facing)
+        with pytest.raises(InputError, match="facing does nothing where keypoints are given"):
+            run(keypoints=torch.zeros(8, 3, 15, 2), facing=facing)
+
+
 class Still(SilhouetteParticleFilter):
     """Particles that stay where they are."""
 

@@ -64,6 +64,7 @@ class Recordings:
         self.views = fit_views([camera for camera, _ in fitted], sizes, rows)
         self.packed: list[Any] = []
         self.notes: list[str] = [note for _, notes in fitted for note in notes]
+        self._check_delays()
 
     def __enter__(self) -> "Recordings":
         return self
@@ -160,6 +161,18 @@ class Recordings:
                           model=model[c][part], silhouette=measured[c][part])
             )  # fmt: skip
         return drawn
+
+    def _check_delays(self) -> None:
+        """Raise `InputError` unless every video has frames after those that are skipped."""
+        from torchpose.errors import InputError
+
+        for path, source, delay in zip(self.videos, self.sources, self._delays, strict=True):
+            count = source.n_frames
+            if delay < 0 or (count is not None and 0 < count <= delay):
+                raise InputError(
+                    f"--delays must be from 0 to below the number of frames, got {delay} for {path}"
+                    + ("" if count is None else f", which has {count}")
+                )
 
     def _open(self) -> "list[VideoSource]":
         from torchpose.video._source import open_video

@@ -175,8 +175,8 @@ def run(
             steps and the bend of the knees tell, which is wrong for a person who walks backwards or
             stands straight.
         rows: the height of the silhouettes, pixels.
-        sharpness: the exponent of the likelihood; not for root (default 100, for the overlap that
-            constrained uses 30; the papers have 1).
+        sharpness: the exponent of the likelihood of silhouettes; not for root, nor for apf without keypoints,
+            which solve for theirs (default 100, for the overlap that constrained uses 30; the papers have 1).
         method_options: the options of the filter.
         fps: the frame rate at which all videos are read, and which keypoints have.
         delays: the number of frames by which each input began too early (default none).
@@ -302,8 +302,8 @@ def _facts(
     """Return what was tracked, and how, by the name of each fact."""
     height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
     values = given.values
-    matters = "sharpness" not in tracker.filter.unused
-    sharpness = f", sharpness {tracker.filter.sharpness:g}" if matters else ""
+    exponent = tracker.filter.sharpness
+    sharpness = "" if tracker.filter.sharpness_cancels else f", sharpness {exponent:g}"
     facts = {
         "videos": f"{len(recordings.videos)} cameras, {recordings.fps:g} fps",
         "silhouettes": f"{width} x {height} pixels, "
@@ -389,6 +389,8 @@ def _check(values: dict[str, Any]) -> None:
     if values["height"] is not None:
         check_height(values["height"], "--height")
     facing, n_inputs = values["facing"], len(values["inputs"])
+    if facing is not None and values["initial_pose"]:
+        raise InputError("--facing does nothing with --initial-pose; leave one of them out")
     if facing is not None and len(facing) != 3:
         raise InputError(f"--facing must be three numbers, got {facing}")
     if values["ignore_still"] and not values["background"]:
@@ -439,7 +441,13 @@ def _tracker(
 ) -> "BodyTracker":
     from torchpose.whole_body._body_tracker import BodyTracker
 
-    return BodyTracker(recordings.rig, method, fps=recordings.fps, **arguments, **options)
+    tracker = BodyTracker(recordings.rig, method, fps=recordings.fps, **arguments, **options)
+    if "sharpness" in options and tracker.filter.sharpness_cancels:
+        raise InputError(
+            f"--sharpness does nothing for --method {tracker.method} on silhouettes alone, whose exponents "
+            "are solved so that a share of the particles survives; leave it out, or take --method sir"
+        )
+    return tracker
 
 
 def _track(

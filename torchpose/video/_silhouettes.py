@@ -159,7 +159,10 @@ class SilhouetteMeasurer:
         self.view = view
         self._maps = _undistortion(view)
         # one by one, since frames are large and only scaled ones are kept
-        without = [self._prepare(frame) for frame in (() if empty is None else empty)]
+        without = [
+            self._prepare(frame, "pictures of the empty scene")
+            for frame in (() if empty is None else empty)
+        ]
         shown = [self._prepare(frame) for frame in (() if frames is None else frames)]
         if not without and not shown:
             raise InputError("give frames of the empty scene, or frames of the video itself")
@@ -193,8 +196,8 @@ class SilhouetteMeasurer:
             return found.numpy()
         return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
 
-    def _prepare(self, frame: Image) -> Image:
-        """Return a frame padded, undistorted and scaled."""
+    def _prepare(self, frame: Image, what: str = "frames") -> Image:
+        """Return a frame padded, undistorted and scaled; `what` it is of, for messages."""
         import cv2
 
         check_rgb("frame", frame, empty=False)
@@ -204,8 +207,8 @@ class SilhouetteMeasurer:
             whole = cv2.copyMakeBorder(frame, 0, below, 0, right, cv2.BORDER_REPLICATE)
         elif frame.shape[1::-1] != (width + right, height + below):
             raise InputError(
-                f"frames of camera {self.view.camera.name!r} must have {width} x {height} pixels, "
-                f"got {frame.shape[1]} x {frame.shape[0]}"
+                f"{what} of camera {self.view.camera.name!r} must have {width} x {height} pixels as its "
+                f"video, got {frame.shape[1]} x {frame.shape[0]}"
             )
         if self._maps is not None:
             whole = cv2.remap(whole, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -301,7 +301,8 @@ class BodyTracker(nn.Module):
             generator: the generator of random numbers.
             lengths: [1], the number of frames of the sequence, if they are fewer; past them the last pose
                 is repeated.
-            facing: [3], the direction in which the person looks at first, world axes, if it is known.
+            facing: [3], the direction in which the person looks at first, world axes, if it is known and the
+                first pose is found in silhouettes.
             n_frames: the expected number of frames, for the bar. progress: whether to show one.
 
         Returns:
@@ -343,6 +344,7 @@ class BodyTracker(nn.Module):
                 refine=refine, progress=progress,
             )  # fmt: skip
         self._check_kind(smoothing, refine, persons)
+        _check_facing(facing, initial_state, keypoints)
         source, measured = self._by_particles.observed(
             silhouettes, given_keypoints(keypoints, confidence, names, covariance)
         )
@@ -404,6 +406,7 @@ class BodyTracker(nn.Module):
                 generator=generator, facing=facing,
             )  # fmt: skip
             return BodyStream(None, 0, None, _names(names))
+        _check_facing(facing, initial_state, keypoints)
         if initial_state is None:
             if silhouettes is None and keypoints is None:
                 raise InputError(
@@ -611,6 +614,14 @@ def _stream_names(state: BodyStream, names: Sequence[str] | None) -> Sequence[st
 def _refuse_given(method: str, **arguments: Any) -> None:
     """Raise `InputError` for arguments that were given to a method that does not use them."""
     _refuse([name for name, v in arguments.items() if v is not None], f"for method {method}")
+
+
+def _check_facing(facing: Any, initial_state: Any, keypoints: Any) -> None:
+    """Refuse a direction where the first pose is given, or found in keypoints, which show it."""
+    if initial_state is not None:
+        _refuse(["facing"] * (facing is not None), "beside an initial_state")
+    if keypoints is not None:
+        _refuse(["facing"] * (facing is not None), "where keypoints are given, which show it")
 
 
 def _person(body: Body | str | Path | None, height: float) -> Body:

@@ -150,6 +150,11 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         self.n_layers, self.survival_rate = n_layers, survival_rate
         self.schedule, self.noise_decay = schedule, decay
 
+    @property
+    def sharpness_cancels(self) -> bool:
+        """Return whether the exponents are solved from the survival rate."""
+        return self.schedule is None
+
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
         """Return the number of likelihoods that one particle costs in a frame: the number of layers.

@@ -160,6 +160,11 @@ class BodyFilterHooks(nn.Module, ABC):
         """Return the variances of the diffusion per frame."""
         return self.step_std.square()
 
+    @property
+    def sharpness_cancels(self) -> bool:
+        """Return whether the exponent of silhouettes alone makes no difference, as where it is solved for."""
+        return "sharpness" in self.unused
+
     def start_std(self) -> Float[Tensor, " D"]:
         """Return the spread of particles about a first pose that was found in images."""
         return 2 * self.step_std

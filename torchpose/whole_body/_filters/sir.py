@@ -52,6 +52,11 @@ class SIRParticleFilter(SilhouetteParticleFilter):
             check_survival_rate(survival_rate, n_particles)
         self.survival_rate = survival_rate
 
+    @property
+    def sharpness_cancels(self) -> bool:
+        """Return whether the exponent is solved from the survival rate."""
+        return self.survival_rate is not None
+
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
