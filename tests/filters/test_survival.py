@@ -75,7 +75,9 @@ def test_a_scale_of_the_log_weights_cancels_and_rows_are_independent():
     torch.testing.assert_close(survival_exponent(50 * values + 7, 0.5), beta / 50)
     skewed = values.exp() * torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64)[:, None]
     alone = torch.stack([survival_exponent(row, 0.5) for row in skewed.flatten(0, 1)])
-    assert torch.equal(survival_exponent(skewed, 0.5).flatten(), alone)  # whatever its neighbours take
+    assert torch.equal(
+        survival_exponent(skewed, 0.5).flatten(), alone
+    )  # whatever its neighbours take
     # normal log-weights: alpha = exp(-beta^2)
     assert float(beta.mean()) == pytest.approx(0.69315**0.5, rel=0.1)
 

@@ -165,7 +165,9 @@ def test_bad_input_is_refused():
     measurer = SilhouetteMeasurer(view, empty=[background])
     with pytest.raises(InputError, match=r"^frames of camera 'left' must have 320 x 240"):
         measurer(background[:100])
-    with pytest.raises(InputError, match=r"^pictures of the empty scene of camera 'left' must have"):
+    with pytest.raises(
+        InputError, match=r"^pictures of the empty scene of camera 'left' must have"
+    ):
         SilhouetteMeasurer(view, empty=[background[:100]])
     with pytest.raises(InputError, match="frame rate"):
         list(read_silhouettes([Frames([background]), Frames([background], 25.0)], [measurer] * 2))

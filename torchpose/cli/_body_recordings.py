@@ -105,6 +105,12 @@ class Recordings:
         ]
         return min(counts, default=None)
 
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """Return the notes of cameras and background, and those of the videos; each once."""
+        read = (note for source in self.sources for note in source.notes)
+        return tuple(dict.fromkeys((*self.notes, *read)))
+
     def silhouettes(self) -> "Iterator[Tensor]":
         """Learn the background; return silhouettes [C, H, W] of one frame after the other.
 

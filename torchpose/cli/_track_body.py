@@ -474,5 +474,4 @@ def _track(
             )  # fmt: skip
         except NobodySeenError:
             return None
-    notes = (*recordings.notes, *(n for s in recordings.sources for n in s.notes))
-    return replace(poses, notes=(*notes, *poses.notes))
+    return replace(poses, notes=(*recordings.all_notes, *poses.notes))

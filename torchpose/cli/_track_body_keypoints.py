@@ -198,7 +198,7 @@ def _track(
         except NobodySeenError:
             return []
     people = [found] if settings.persons is None else found
-    notes = (*keypoints.notes, *(() if recordings is None else recordings.notes))
+    notes = (*keypoints.notes, *(() if recordings is None else recordings.all_notes))
     return [replace(poses, notes=(*notes, *poses.notes)) for poses in people]
 
 
@@ -340,6 +340,7 @@ class Films:
         self._sources = [open_video(path) for path in videos]
         self.rates = [float(source.fps) for source in self._sources]
         self.sizes = [source.size for source in self._sources]
+        self._calibrated = cameras
         self._cameras = [
             fit_to_size(camera, size, path)[0]
             for camera, size, path in zip(cameras, self.sizes, videos, strict=True)
@@ -355,7 +356,7 @@ class Films:
     def recordings(self, fps: float, settings: SilhouetteSettings) -> Recordings:
         """Return the same videos at a frame rate, to become silhouettes."""
         return Recordings(
-            self._videos, self._cameras, settings.rows, fps=fps, delays=self._delays,
+            self._videos, self._calibrated, settings.rows, fps=fps, delays=self._delays,
             background=settings.background, ignore_still=settings.ignore_still,
         )  # fmt: skip
 
