@@ -19,7 +19,8 @@ from torchpose.whole_body import (
     constant_velocity_std,
     render,
 )
-from torchpose.whole_body._filters.posture_gate import PostureGate, Rows
+from torchpose.whole_body._filters.constrained import log_share
+from torchpose.whole_body._filters.posture_gate import PostureGate, Redrawn, Rows
 
 BEND, WAVE = space("bend"), space("wave")
 STD = torch.full((36,), 0.03, dtype=torch.float64)
@@ -135,6 +136,19 @@ def test_the_weights_differ_between_the_two_forms():
         _, out = tracker.step(state, FRAME, None, generator=generator(1))
         means.append(out.mean)
     assert (means[0] - means[1]).abs().max() > 1e-4
+
+
+def test_a_copy_with_exchanged_legs_has_a_share_of_its_own():
+    """Its draws say nothing about how often those of the other copies are accepted."""
+    tracker = ConstrainedParticleFilter(BODY, BEND, 4, weights="normalised", process_cov=STD**2)
+    copies = torch.tensor([[0, 0, 0, 3]])
+    memory = tracker.swap_memory(copies, torch.tensor([[False, False, True, False]]))
+    yes, share = torch.ones(4, dtype=torch.bool), torch.tensor([0.5, 0.3, 0.1, 0.2]).double()
+    found = Redrawn(torch.zeros(4, 36), yes, yes, yes.long(), share)
+    expected = torch.tensor([[0.4, 0.4, 0.1, 0.2]]).double().log()
+    torch.testing.assert_close(log_share(found, memory), expected)
+    published = ConstrainedParticleFilter(BODY, ActionBank([BEND]), 4, process_cov=STD**2)
+    assert torch.equal(published.swap_memory(copies, yes[None]), copies)  # actions
 
 
 def test_every_particle_belongs_to_the_action():

@@ -3,7 +3,7 @@
 from typing import Any, Unpack
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_choice
@@ -151,6 +151,20 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         if self._copies_known:
             return torch.arange(n, device=particles.device).expand(batch, n)
         return None
+
+    def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
+        """Return the memory of particles of which some have exchanged their legs: no copies of the others.
+
+        Args:
+            memory: the memory of the particles, as in the state.
+            swapped: [B, N], True where a particle has exchanged its legs.
+
+        Returns:
+            Memory of the same shape; that of actions as it was.
+        """
+        if not self._copies_known:
+            return memory
+        return memory + memory.shape[1] * swapped
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor:
         """Return the velocity, zero, and the estimate before the first frame.
@@ -363,12 +377,14 @@ def log_share(found: Redrawn, ancestors: Int[Tensor, "B N"]) -> Float[Tensor, "B
     particles stay exact on average. Where everything was clamped all are alike.
 
     Args:
-        found: of R = B N rows. ancestors: number of the particle that each one is a copy of.
+        found: of R = B N rows. ancestors: number of the particle that each one is a copy of, N more where
+            it has exchanged its legs.
     """
     shape = ancestors.shape
     share, accepted = found.share.view(shape), found.accepted.view(shape)
-    total = torch.zeros_like(share).scatter_add(1, ancestors, share)
-    count = torch.zeros_like(share).scatter_add(1, ancestors, accepted.to(share))
+    none = share.new_zeros(shape[0], 2 * shape[1])
+    total = none.scatter_add(1, ancestors, share)
+    count = none.scatter_add(1, ancestors, accepted.to(share))
     log_z = (total / count.clamp_min(1)).log().gather(1, ancestors)
     log_z = log_z.masked_fill(~accepted, -torch.inf)
     return torch.where(accepted.any(1, keepdim=True), log_z, 0.0)
