@@ -3,7 +3,7 @@
 from itertools import combinations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
@@ -17,18 +17,24 @@ def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
     The pair of cameras that most others agree with decides; all that agree then count, by linear least
     squares of u (M p + m)_3 = (M p + m)_12.
     """
-    rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
-    right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
-    size = maps.matrix[:, 2].norm(dim=-1)[:, None, None]
-    rows, right = rows / size[..., None], right / size
+    chosen = agreeing(maps, frame)
+    joints = triangulate_all(maps, frame, chosen)
+    return torch.where((chosen.sum(1) >= 2)[..., None], joints, torch.nan)
+
+
+def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
+    """Return the keypoints of the cameras that agree on a joint.
+
+    Args:
+        maps: the cameras. frame: the keypoints.
+    """
+    equations = _equations(maps, frame)
     there = frame.inlier > 0
 
     def solve(use: Tensor) -> Tensor:
-        scaled = rows * use.to(rows)[..., None, None]
-        normal = (scaled.mT @ rows).sum(1) + 1e-9 * torch.eye(3).to(rows)
-        return torch.linalg.solve(normal, (scaled.mT @ right[..., None]).sum(1)).squeeze(-1)
+        return _solved(*equations, use)
 
-    best = torch.full_like(rows[:, 0, :, 0, 0], -1.0)
+    best = torch.full_like(frame.variance[:, 0], -1.0)
     chosen = torch.zeros_like(there)
     for pair in combinations(range(len(maps.shift)), 2):
         use = torch.zeros_like(there)
@@ -43,4 +49,34 @@ def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
         score = torch.where((agree & use).sum(1) == 2, score, -1.0)
         chosen = torch.where((score > best)[:, None], agree, chosen)
         best = torch.maximum(best, score)
-    return torch.where((chosen.sum(1) >= 2)[..., None], solve(chosen), torch.nan)
+    return chosen
+
+
+def triangulate_all(
+    maps: RigMaps, frame: KeypointFrame, use: Bool[Tensor, "B C J"]
+) -> Float[Tensor, "B J 3"]:
+    """Return joints by all keypoints that are to be used, whether or not they agree.
+
+    Args:
+        maps: the cameras. frame: the keypoints. use: which of them count.
+    """
+    return _solved(*_equations(maps, frame), use)
+
+
+def _equations(
+    maps: RigMaps, frame: KeypointFrame
+) -> tuple[Float[Tensor, "B C J 2 3"], Float[Tensor, "B C J 2"]]:
+    """Return rows and right sides of linear equations of the joints."""
+    rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
+    right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
+    size = maps.matrix[:, 2].norm(dim=-1)[:, None, None]
+    return rows / size[..., None], right / size
+
+
+def _solved(
+    rows: Float[Tensor, "B C J 2 3"], right: Float[Tensor, "B C J 2"], use: Bool[Tensor, "B C J"]
+) -> Float[Tensor, "B J 3"]:
+    """Return the joints of least squares."""
+    scaled = rows * use.to(rows)[..., None, None]
+    normal = (scaled.mT @ rows).sum(1) + 1e-9 * torch.eye(3).to(rows)
+    return torch.linalg.solve(normal, (scaled.mT @ right[..., None]).sum(1)).squeeze(-1)

@@ -34,13 +34,17 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     details_of_cameras,
     refine_cameras,
 )
+from torchpose.whole_body._keypoints.camera_order import astray, notes_on_order
 from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import (
     TOO_FEW,
     late_note,
     notes_of,
+    notes_on_a_rolled_camera,
+    notes_on_left_out_cameras,
     notes_on_still_cameras,
+    notes_on_turned_cameras,
 )
 from torchpose.whole_body._keypoints.keypoint_tracker import (
     LEAST_JOINTS,
@@ -204,7 +208,8 @@ class KeypointBodyTracker(nn.Module):
                 rig, self.fps, former.motion, up=former.up, lone=self.tracker.lone
             )
             # the frames are those from the first one on that may begin: it has waited already
-            return tracker(moved.map(lambda value: value[None]), smooth, progress, waited=math.inf)
+            moved = moved.map(lambda value: value[None])
+            return tracker(moved, smooth, progress, waited=math.inf, watch=False)
 
         single = frames.map(lambda value: value[0])
         found = refine_cameras(
@@ -366,11 +371,22 @@ class KeypointBodyTracker(nn.Module):
             self.sized, first_frame,
         )  # fmt: skip
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
+        turned = notes_on_turned_cameras(self.rig.names, poses.turns, first_frame)
+        notes += notes_on_left_out_cameras(self.rig.names, poses.off, first_frame) + turned
+        if len(self.rig) == 1 and self.tracker.filter.up is None:
+            rolled = notes_on_a_rolled_camera(self.rig.names[0], frame.pixels[:, 0], there[:, 0])
+            return notes + rolled
         if len(self.rig) == 1 or not cameras:
             return notes
+        if astray(poses.inlier, poses.turns, there):
+            order = notes_on_order(self.rig.names, self.tracker.filter.maps, frame)
+            if order:
+                return (*order, *notes)
         rig = self.rig if refined is None else refined.rig
         exchange = self.tracker.filter.exchange
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
+        if turned:  # that is said already
+            doubts = doubts._replace(turns=torch.zeros_like(doubts.turns))
         return (*notes, *notes_on_cameras(self.rig.names, doubts))
 
 

@@ -2,8 +2,11 @@
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from torchpose.body._skeleton import BODY_15
 
 TOO_FEW = "too few keypoints were given"
 """Why a track begins late."""
@@ -11,6 +14,8 @@ TOO_FEW = "too few keypoints were given"
 _DISAGREES = 0.5  # share of a camera's keypoints that are nobody's, above which it is said
 _MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
 _GAP = 30  # frames without keypoints that are worth a word
+_LEAST_TURN = 0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
+_LEANS = 12.0  # degrees by which a trunk leans in most images of a camera that may be rolled
 
 
 def late_note(first_frame: int, why: str) -> tuple[str, ...]:
@@ -99,10 +104,73 @@ def notes_on_still_cameras(
     still = both.any(-1) & ~moved & moved.any(-1, keepdim=True)
     return tuple(
         f"the keypoints of camera {name} are exactly the same in frames {first_frame + first} to "
-        f"{first_frame + last + 1}; check whether its video stands still"
+        f"{first_frame + last + 1}, which were not used; check whether its video stands still"
         for name, flags in zip(cameras, still.unbind(1), strict=True)
         for first, last in _runs(flags)
         if last - first + 2 >= _GAP
+    )
+
+
+def notes_on_left_out_cameras(
+    cameras: Sequence[str], off: Bool[Tensor, "T C"], first_frame: int = 0
+) -> tuple[str, ...]:
+    """Return notes on cameras that were left out.
+
+    Args:
+        cameras: their names. off: which were left out. first_frame: number of the first of the frames.
+    """
+    return tuple(
+        f"camera {name} was left out in frames {first_frame + first} to {first_frame + last}, since it does "
+        "not see what the others see"
+        for name, flags in zip(cameras, off.unbind(1), strict=True)
+        for first, last in _runs(flags)
+    )
+
+
+def notes_on_turned_cameras(
+    cameras: Sequence[str], turns: Float[Tensor, "T C"], first_frame: int = 0
+) -> tuple[str, ...]:
+    """Return a note on cameras whose keypoints were turned back, if there are any.
+
+    Args:
+        cameras: their names. turns: radians by which keypoints were turned.
+        first_frame: number of the first of the frames.
+    """
+    degrees = torch.rad2deg(turns)
+    much = degrees > _LEAST_TURN
+    said = [
+        f"camera {cameras[c]} (by {float(degrees[:, c].amax()):.1f} degrees from frame "
+        f"{first_frame + int(much[:, c].int().argmax())} on)"
+        for c in much.any(0).nonzero().flatten().tolist()
+    ]
+    if not said:
+        return ()
+    return (
+        f"against the calibration {' and '.join(said)} seem{'s' * (len(said) == 1)} to be turned; keypoints "
+        "were turned back, but where the person stands in the room may be wrong; "
+        'refine="extrinsics" (--refine extrinsics) gives corrected cameras',
+    )
+
+
+def notes_on_a_rolled_camera(
+    name: str, pixels: Float[Tensor, "T J 2"], there: Bool[Tensor, "T J"]
+) -> tuple[str, ...]:
+    """Return a note if a single camera that is taken to be level sees the person lean most of the time.
+
+    Args:
+        name: of the camera. pixels: of keypoints. there: which there were.
+    """
+    low, top = (BODY_15.joint(joint) for joint in ("pelvis", "neck"))
+    axis = (pixels[:, top] - pixels[:, low])[there[:, top] & there[:, low]]
+    if len(axis) < _GAP:
+        return ()
+    lean = torch.rad2deg(torch.atan2(axis[:, 0], -axis[:, 1])).median()
+    if abs(float(lean)) < _LEANS:
+        return ()
+    return (
+        f"the person leans by {abs(float(lean)):.0f} degrees in most images of camera {name}, which is taken "
+        "to be level since no up is given; if the camera is rolled, or its video turned, give up (--up), the "
+        "axis of the world that points up, or turn the images",
     )
 
 

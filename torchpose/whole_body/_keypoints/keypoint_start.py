@@ -51,17 +51,19 @@ _SIDED = ("shoulder", "hip")
 _LEAST_WIDTH = 0.05  # metres between left and right that tell a direction
 
 
-def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
+def start(
+    filter: BodyKalmanFilter, frame: KeypointFrame, n_headings: int = _HEADINGS
+) -> CorrectedBody:
     """Return the likeliest starts of B persons whom several cameras see.
 
     Args:
-        filter: that tracks on. frame: the first keypoints.
+        filter: that tracks on. frame: the first keypoints. n_headings: that are tried.
     """
     joints = triangulate(filter.maps, frame)
-    state = _begun(filter, joints, joints.isfinite().all(-1), _HEADINGS)
+    state = _begun(filter, joints, joints.isfinite().all(-1), n_headings)
     every = torch.arange(len(joints), device=joints.device)
-    found = filter.correct(state, frame.take(every.repeat_interleave(_HEADINGS)), _WIDTHS)
-    best = every * _HEADINGS + found.log_evidence.view(-1, _HEADINGS).argmax(-1)
+    found = filter.correct(state, frame.take(every.repeat_interleave(n_headings)), _WIDTHS)
+    best = every * n_headings + found.log_evidence.view(-1, n_headings).argmax(-1)
     return _by_wider(filter, frame, state.take(best), found.take(best))
 
 

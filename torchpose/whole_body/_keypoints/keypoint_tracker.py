@@ -18,6 +18,15 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
+from torchpose.whole_body._keypoints.faulty_cameras import (
+    LEAST_CAMERAS,
+    CameraFaults,
+    corrected,
+    find_faults,
+    watched,
+    with_returned,
+    without_still,
+)
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
@@ -51,6 +60,7 @@ class KeypointStream(NamedTuple):
             none, which counts half, or the person has waited for a start.
         alone: [B], which of several cameras alone the person is followed by, -1 if by all.
         memory: [B, L, W], of the network that lifts keypoints of one camera.
+        faults: of the cameras, as each person tells them.
     """
 
     state: BodyGaussian
@@ -58,6 +68,7 @@ class KeypointStream(NamedTuple):
     lost: Tensor
     alone: Tensor
     memory: Tensor
+    faults: CameraFaults
 
 
 class KeypointPoses(NamedTuple):
@@ -69,6 +80,8 @@ class KeypointPoses(NamedTuple):
         inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of
             arms, of legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...],
             where tracking began. alone: [...], which of several cameras alone decided, -1 if all did.
+        turns: [..., C], radians by which keypoints of a camera were turned back. off: [..., C], which cameras
+            counted not.
     """
 
     joints: Tensor
@@ -81,6 +94,8 @@ class KeypointPoses(NamedTuple):
     coasting: Tensor
     started: Tensor
     alone: Tensor
+    turns: Tensor
+    off: Tensor
 
 
 KeypointStep = tuple[KeypointStream, KeypointPoses, CorrectedBody]
@@ -119,19 +134,21 @@ class KeypointTracker(nn.Module):
         smoothing: bool = False,
         progress: bool = False,
         waited: float = 0.0,
+        watch: bool = True,
     ) -> KeypointPoses:
         """Track whole sequences.
 
         Args:
             frames: [B, T, C, J, ...]. smoothing: whether later frames count too. progress: show a bar.
             waited: frames for which the first one has waited for a second camera already.
+            watch: as of `advance`.
         """
         n_frames = frames.pixels.shape[1]
         stream: KeypointStream | None = None
         poses, corrected = [], []
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
             frame = frames.map(lambda value: value[:, t])  # noqa: B023
-            stream, pose, found = self.advance(stream, frame, waited=waited)
+            stream, pose, found = self.advance(stream, frame, waited=waited, watch=watch)
             poses.append(pose)
             if smoothing:
                 corrected.append(found)
@@ -144,18 +161,27 @@ class KeypointTracker(nn.Module):
         frame: KeypointFrame,
         predicted: BodyGaussian | None = None,
         waited: float = 0.0,
+        watch: bool = True,
     ) -> KeypointStep:
         """Track one more frame; the first one begins where there is no stream yet.
 
         Args:
             stream: of the frame before. frame: the keypoints. predicted: the states of the stream one frame
                 later, if they are known already. waited: frames that the first one has waited for already.
+            watch: whether cameras may be found to be wrong.
 
         Returns:
             The next stream, the poses of the frame [B, ...], and what the correction gave.
         """
-        step = self._advanced(stream, frame, predicted, waited)
-        return step if self.lifter is not None else self._with_lone_cameras(stream, frame, step)
+        if self.lifter is not None or not watch:
+            step = self._advanced(stream, frame, predicted, waited)
+            return step if self.lifter is not None else self._with_lone_cameras(stream, frame, step)
+        faults = CameraFaults.none(frame) if stream is None else stream.faults
+        given = without_still(frame, faults)
+        right = corrected(given, faults, self.filter.maps)
+        step = self._advanced(stream, right, predicted, waited)
+        step = self._with_lone_cameras(stream, right, step)
+        return self._watched(step, frame, given, right)
 
     def _advanced(
         self,
@@ -171,7 +197,8 @@ class KeypointTracker(nn.Module):
         if stream is None:
             due, nobody = enough, torch.full_like(enough, NOBODY, dtype=torch.long)
             found = self._started(frame, lifted)
-            stream = KeypointStream(found.state, enough, torch.zeros_like(count), nobody, memory)
+            lost, faults = torch.zeros_like(count), CameraFaults.none(frame)
+            stream = KeypointStream(found.state, enough, lost, nobody, memory, faults)
         else:
             predicted = self.filter.predict(stream.state) if predicted is None else predicted
             found = self._followed(frame, lifted, predicted)
@@ -182,15 +209,23 @@ class KeypointTracker(nn.Module):
             if bool(due.any()):
                 found = self._begun_anew(found, frame, lifted, due)
             lost, alone = torch.where(due, 0.0, stream.lost), torch.where(due, NOBODY, stream.alone)
-            stream = KeypointStream(found.state, stream.begun | due, lost, alone, memory)
-        inlier = found.weighed.inlier
+            stream = KeypointStream(
+                found.state, stream.begun | due, lost, alone, memory, stream.faults
+            )
         stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
-        pose = KeypointPoses(
+        return stream, self._posed(stream, found, due), found
+
+    def _posed(
+        self, stream: KeypointStream, found: CorrectedBody, started: Bool[Tensor, " B"]
+    ) -> KeypointPoses:
+        """Return the poses of a frame."""
+        inlier = found.weighed.inlier
+        return KeypointPoses(
             found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
-            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due, stream.alone,
+            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
+            stream.faults.angle, stream.faults.off,
         )  # fmt: skip
-        return stream, pose, found
 
     def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:
         """Return the frames in which tracking begins, T where it never does.
@@ -212,6 +247,46 @@ class KeypointTracker(nn.Module):
         n_needed = min(2, frame.inlier.shape[-2])
         enough = (there.sum(-2) >= n_needed).sum(-1) >= LEAST_JOINTS
         return enough | ((waited > _PATIENCE * self.filter.fps) & _sees_enough(there).any(-1))
+
+    # --- cameras that are wrong -------------------------------------------------------------------
+
+    def _watched(
+        self, step: KeypointStep, frame: KeypointFrame, given: KeypointFrame, right: KeypointFrame
+    ) -> KeypointStep:
+        """Return the frame with cameras that are found to be wrong left out, or turned back.
+
+        Args:
+            step: the frame by cameras as they were known. frame: the keypoints. given: those that are new.
+            right: as cameras would see them that are right.
+        """
+        stream, pose, found = step
+        faults = stream.faults._replace(pixels=frame.pixels, inlier=frame.inlier)
+        if right.inlier.shape[1] >= LEAST_CAMERAS:
+            several = stream.begun & (stream.alone < 0)
+            faults, due = watched(self.filter, faults, found, right, several, pose.started)
+            if bool(faults.off.any()):
+                faults = with_returned(self.filter, faults, found, given)
+            rows = due.nonzero().squeeze(-1)
+            if len(rows):
+                stream = stream._replace(faults=faults)
+                return self._explained((stream, pose, found), given, rows)
+        return stream._replace(faults=faults), pose, found
+
+    def _explained(
+        self, step: KeypointStep, frame: KeypointFrame, rows: Int[Tensor, " N"]
+    ) -> KeypointStep:
+        """Return the frame with some persons begun anew, if that explains what cameras see."""
+        faults, found, better = find_faults(
+            self.filter, frame.take(rows), taken(step[0].faults, rows)
+        )
+        stream, pose, _ = own = taken(step, rows)
+        stream = stream._replace(faults=faults)
+        anew = stream._replace(state=found.state, lost=torch.zeros_like(stream.lost))
+        begun = anew, self._posed(anew, found, torch.ones_like(better)), found
+        kept = stream, pose, own[2]
+        chosen = better.nonzero().squeeze(-1)
+        after = mapped(lambda old, new: old.index_copy(0, chosen, new[chosen]), kept, begun)
+        return mapped(lambda old, new: old.index_copy(0, rows, new), step, after)
 
     # --- one of several cameras -------------------------------------------------------------------
 
@@ -256,12 +331,14 @@ class KeypointTracker(nn.Module):
             there = _sees_enough(frame.inlier > 0)
             gone = ~(seen.inlier > 0).flatten(1).any(-1) & there.any(-1)
             lost = torch.where(gone, before.lost + 1, lost)
-        stream = KeypointStream(state, after.begun, lost, alone, after.memory)
+        stream = KeypointStream(state, after.begun, lost, alone, after.memory, stream.faults)
         pose = one._replace(
             covariance=self._unsure(by_one.joint_cov, by_one.joints, alone),
             inlier=into_all(torch.zeros_like(pose.inlier), one.inlier, camera),
             exchanged=into_all(pose.exchanged, one.exchanged, camera),
             alone=alone,
+            turns=pose.turns,
+            off=pose.off,
         )
         found = by_one._replace(state=state, weighed=found.weighed)
         return stream, pose, found

@@ -120,7 +120,7 @@ class PeopleTracker:
         gains = detection_gains(self.tracker.filter, predicted, frame)
         chosen = self._chosen(gains, predicted, frame, there)
         keypoints = taken_detections(frame, chosen)
-        after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted)
+        after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted, watch=False)
         found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
         weak = stream.missed > _ALONE_TIME * self.tracker.filter.fps
         explained = (gains > 0).masked_fill(weak[:, None, None], False).any(0)
@@ -170,7 +170,7 @@ class PeopleTracker:
         if not len(groups):
             return stream, found
         keypoints = taken_detections(frame, groups)
-        bodies, poses, corrected = self.tracker.advance(None, keypoints)
+        bodies, poses, corrected = self.tracker.advance(None, keypoints, watch=False)
         sure = _explained(poses, keypoints) >= _needed(owner, found)
         former, identity = _owned_by(stream.number, owner, -1), _owned_by(stream.identity, owner, 0)
         number = torch.arange(len(groups), device=groups.device) + stream.n_begun

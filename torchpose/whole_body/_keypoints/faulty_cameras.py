@@ -1,0 +1,236 @@
+"""Notice cameras that are turned, that see something else, or whose video stands still, and track without that.
+
+A camera is watched by the share of its keypoints that are those of the body. Where it stays low, bodies begin
+anew with the keypoints of that frame under several explanations: cameras are right; one, or all, are turned
+(`turned_cameras`); one, or all but two, see nothing of the person. The likeliest one by the evidence of the
+filter holds from then on. Two cameras do not tell which is wrong, so there are three at least.
+"""
+
+import math
+from itertools import combinations
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.whole_body._keypoints.body_kalman import (
+    FEW_INLIERS,
+    BodyKalmanFilter,
+    CorrectedBody,
+)
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    Beliefs,
+    KeypointFrame,
+    RigMaps,
+    readings_of,
+    see,
+    squared_errors,
+    weigh,
+)
+from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.turned_cameras import find_turns, turned
+
+LEAST_CAMERAS = 3
+LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
+_PATIENCE = 0.5  # seconds for which a camera sees something else before an explanation is looked for
+_PAUSE = 5.0  # seconds until the next search, where none was found
+_WIDE = 2.0  # factor of the noise's variance, above which a camera may be wrong
+_LEAST_GAIN = 10.0  # log-evidence by which an explanation must be better than right cameras
+_FARTHEST_TURN = 0.5  # radians, of a camera that is used nevertheless
+_RETURN = 0.25  # seconds for which a camera sees the body again before it counts again
+_HEADINGS = 2
+_MOST_PAIRS = 6  # cameras, with which all but two may be wrong
+
+
+class CameraFaults(NamedTuple):
+    """Holds what is wrong with C cameras that see B persons.
+
+    Attributes:
+        turn: [B, C, 3, 3], rotation in world axes of what a camera sees. off: [B, C], whether it counts not.
+        wrong: [B], whether any camera is turned or off.
+        doubted: [B], frames in a row in which a camera has seen something else, below 0 after a search.
+        back: [B, C], frames in a row in which one that counts not has seen the body.
+        pixels, inlier: [B, C, J, 2], [B, C, J], keypoints of the frame before, as they were detected.
+    """
+
+    turn: Tensor
+    off: Tensor
+    wrong: Tensor
+    doubted: Tensor
+    back: Tensor
+    pixels: Tensor
+    inlier: Tensor
+
+    @property
+    def angle(self) -> Float[Tensor, "B C"]:
+        """Return by how much cameras are turned, radians."""
+        if not bool(self.wrong.any()):
+            return torch.zeros_like(self.back)
+        cosine = (self.turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+        return cosine.clamp(-1, 1).arccos()
+
+    @classmethod
+    def none(cls, frame: KeypointFrame) -> Self:
+        """Return right cameras, before a first frame."""
+        shape = frame.inlier.shape[:2]
+        new = frame.inlier.new_zeros
+        no = torch.zeros(shape, dtype=torch.bool, device=frame.inlier.device)
+        return cls(
+            torch.eye(3).to(frame.pixels).expand(*shape, 3, 3), no, no[:, 0], new(shape[0]),
+            new(shape), frame.pixels, torch.zeros_like(frame.inlier),
+        )  # fmt: skip
+
+
+def corrected(frame: KeypointFrame, faults: CameraFaults, maps: RigMaps) -> KeypointFrame:
+    """Return keypoints as cameras would see them that are right, without those of cameras that are off."""
+    if bool(faults.wrong.any()):
+        frame = turned(frame, faults.turn, maps)
+        frame = frame._replace(inlier=frame.inlier.masked_fill(faults.off[..., None], 0.0))
+    return frame
+
+
+def without_still(frame: KeypointFrame, faults: CameraFaults) -> KeypointFrame:
+    """Return keypoints without those of cameras whose image is that of the frame before.
+
+    All keypoints of such a camera are the same to the last digit, while most of another camera's are not.
+    """
+    moved = (frame.pixels != faults.pixels).any(-1)
+    if bool(moved.any(-1).all()):
+        return frame
+    both = (frame.inlier > 0) & (faults.inlier > 0)
+    count, n_moved = both.sum(-1), (moved & both).sum(-1)
+    most_moved = (2 * n_moved > count) & (count >= LEAST_JOINTS)
+    still = ~moved.any(-1) & (count >= LEAST_JOINTS) & most_moved.any(-1, keepdim=True)
+    return frame._replace(inlier=frame.inlier.masked_fill(still[..., None], 0.0))
+
+
+def find_faults(
+    filter: BodyKalmanFilter, frame: KeypointFrame, faults: CameraFaults
+) -> tuple[CameraFaults, CorrectedBody, Bool[Tensor, " B"]]:
+    """Return the likeliest faults of cameras, who begins anew with them, and whether they are new.
+
+    Args:
+        filter: that tracks on. frame: keypoints as they were detected. faults: that were known so far.
+    """
+    plain = start(filter, frame)
+    tried, price = _explanations(frame, filter.maps)
+    n = len(tried.off) // len(frame.pixels)
+    every = torch.arange(len(frame.pixels), device=price.device)
+    given = frame.take(every.repeat_interleave(n))
+    right = corrected(given, tried, filter.maps)
+    found = start(filter, right, _HEADINGS)
+    unexplained = (given.inlier > 0) & tried.off[..., None]
+    nobody = (unexplained * filter.maps.log_area[:, None]).sum((-2, -1))
+    evidence = found.log_evidence - nobody - price
+    refused = _enough(right) & _few_or_wide(found, right) | (tried.angle > _FARTHEST_TURN)
+    evidence = torch.where(refused.any(-1), -math.inf, evidence).view(-1, n)
+    best = every * n + evidence.argmax(-1)
+    better = evidence.amax(-1) > plain.log_evidence + _LEAST_GAIN
+    rows = better.nonzero().squeeze(-1)
+    none = CameraFaults.none(frame)
+    pause = torch.full_like(faults.doubted, -_PAUSE * filter.fps)
+    after = none._replace(doubted=torch.where(better, 0.0, pause))
+    chosen = taken(tried, best[rows])
+    after = mapped(lambda old, new: old.index_copy(0, rows, new), after, chosen)
+    after = after._replace(pixels=faults.pixels, inlier=faults.inlier)
+    return after, plain.put(rows, found.take(best[rows])), better | faults.wrong
+
+
+def _explanations(
+    frame: KeypointFrame, maps: RigMaps
+) -> tuple[CameraFaults, Float[Tensor, " N"]]:
+    """Return explanations of frames, those of one after the other, and what they cost in log-evidence."""
+    count, n_cameras = frame.inlier.shape[:2]
+    one = torch.eye(n_cameras, dtype=torch.bool, device=frame.inlier.device)
+    free = torch.cat([one, torch.ones_like(one[:1])])
+    off = [one]
+    if 3 < n_cameras <= _MOST_PAIRS:
+        pairs = [list(pair) for pair in combinations(range(n_cameras), 2)]
+        off.append(torch.stack([~one[pair].any(0) for pair in pairs]))
+    off = torch.cat(off)
+    none = torch.zeros_like
+    free, off = (
+        torch.cat(parts).repeat(count, 1)
+        for parts in ((free, none(off)), (none(free), off))
+    )
+    n = len(free) // count
+    rows = torch.arange(count, device=free.device).repeat_interleave(n)
+    tried = CameraFaults.none(frame.take(rows))
+    some = free.any(-1).nonzero().squeeze(-1)
+    turns = find_turns(frame.take(rows[some]), free[some], maps)
+    price = frame.inlier.new_zeros(len(free)).index_copy(0, some, turns.price)
+    tried = tried._replace(
+        turn=tried.turn.index_copy(0, some, turns.matrix), off=off, wrong=torch.ones_like(tried.wrong)
+    )
+    return tried, price
+
+
+def watched(
+    filter: BodyKalmanFilter,
+    faults: CameraFaults,
+    found: CorrectedBody,
+    frame: KeypointFrame,
+    begun: Bool[Tensor, " B"],
+    started: Bool[Tensor, " B"],
+) -> tuple[CameraFaults, Bool[Tensor, " B"]]:
+    """Return the faults with a frame counted, and for whom an explanation is to be looked for.
+
+    Args:
+        filter: that found. faults: that are known. found: the bodies. frame: their keypoints.
+        begun: who is tracked by all cameras. started: with this frame.
+    """
+    doubtful = _few_or_wide(found, frame)
+    if not bool((doubtful | started[:, None] | (faults.doubted != 0)[:, None]).any()):
+        return faults, started
+    enough = _enough(frame)
+    doubtful = doubtful | (started[:, None] & (_noise(filter, found, frame) > _WIDE))
+    doubtful = (doubtful & enough).any(-1) & begun & (enough.sum(-1) >= LEAST_CAMERAS)
+    pausing = faults.doubted < 0
+    doubted = torch.where(doubtful | pausing, faults.doubted + 1, 0.0)
+    due = doubtful & ~pausing & (started | (doubted > _PATIENCE * filter.fps))
+    return faults._replace(doubted=doubted), due
+
+
+def with_returned(
+    filter: BodyKalmanFilter, faults: CameraFaults, found: CorrectedBody, frame: KeypointFrame
+) -> CameraFaults:
+    """Return the faults without cameras that count not and have seen the body again for some time.
+
+    Args:
+        filter: that found. faults: that are known. found: the bodies, without these cameras.
+        frame: the keypoints of all cameras.
+    """
+    frame = turned(frame, faults.turn, filter.maps)
+    beliefs = Beliefs(found.state.log_odds, torch.ones_like(found.state.scale))
+    weighed = weigh(
+        readings_of(frame, filter.exchange), see(filter.maps, found.joints), filter.maps, beliefs,
+        filter.exchange, found.joint_cov,
+    )  # fmt: skip
+    sees = _enough(frame) & (weighed.inlier.sum(-1) >= FEW_INLIERS * frame.inlier.sum(-1))
+    back = torch.where(faults.off & sees, faults.back + 1, 0.0)
+    off = faults.off & (back <= _RETURN * filter.fps)
+    straight = (faults.turn == torch.eye(3).to(faults.turn)).flatten(1).all(-1)
+    return faults._replace(off=off, back=back, wrong=off.any(-1) | ~straight)
+
+
+def _enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:
+    """Return which cameras see so much of a person that they tell whether it is the body."""
+    return (frame.inlier > 0).sum(-1) >= LEAST_JOINTS
+
+
+def _few_or_wide(found: CorrectedBody, frame: KeypointFrame) -> Bool[Tensor, "B C"]:
+    """Return of which cameras few keypoints are of the body, or by a noise that is wide."""
+    few = found.weighed.inlier.sum(-1) < FEW_INLIERS * frame.inlier.sum(-1)
+    return few | (found.state.scale > _WIDE)
+
+
+def _noise(
+    filter: BodyKalmanFilter, found: CorrectedBody, frame: KeypointFrame
+) -> Float[Tensor, "B C"]:
+    """Return the squared errors of the keypoints of bodies over the variance of their noise."""
+    readings = readings_of(frame, filter.exchange)
+    seen = see(filter.maps, found.joints)
+    sums, count = squared_errors(readings, seen, found.weighed, found.joint_cov)
+    return sums / count.clamp_min(1.0)

@@ -1,0 +1,123 @@
+"""Find by how much cameras are turned, from the keypoints of one frame, with its joints eliminated.
+
+A camera that is turned about its centre sees z where it should see z' = M exp([w]x) M^-1 z, with M = K R.
+So the keypoints of such a camera are corrected, and the cameras stay as they are. Unknown are w of the cameras
+that may be turned and the joints p. Steps of Gauss and Newton minimise
+
+    nu/2 sum_cj log(1 + |z'_cj - h_c(p_j)|^2 / (nu R_cj)) + 2 sum_c log(1 + |w_c|^2 / s^2)
+
+by weights, with noise R that is wide at first. The prior about turns is Cauchy's: rather one camera is turned
+by much than all by a little.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate_all
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
+
+_TURN = 0.02  # radians, the scale s of turns before they are estimated
+_FREEDOM = 4.0  # nu, of Student's distribution of the errors
+_WIDTHS = (400.0, 400.0, 100.0, 100.0, 25.0, 25.0, 9.0, 4.0, 2.0, *[1.0] * 6)
+_KNOWN = 1e12  # per square radian, the information about cameras that are not turned
+_JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cameras do
+
+
+class Turns(NamedTuple):
+    """Holds turns [N, C, 3, 3] of cameras in world axes, and what each choice of free turns costs [N].
+
+    The cost is 2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2 with S the information about the turns: what free
+    turns take from the log-evidence, about Laplace's approximation.
+    """
+
+    matrix: Tensor
+    price: Tensor
+
+
+def turned(
+    frame: KeypointFrame, turn: Float[Tensor, "B C 3 3"], maps: RigMaps
+) -> KeypointFrame:
+    """Return keypoints as cameras would see them that are not turned.
+
+    Args:
+        frame: the keypoints. turn: of the cameras, in world axes. maps: the cameras.
+    """
+    return frame._replace(pixels=_pixels(_rays(frame, maps) @ turn.mT, maps)[0])
+
+
+def find_turns(
+    frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps
+) -> Turns:
+    """Return the turns of cameras that explain the keypoints of a frame.
+
+    Args:
+        frame: the keypoints [N, C, J]. free: which cameras may be turned. maps: the cameras.
+    """
+    rays, there = _rays(frame, maps), frame.inlier > 0
+    right = there & ~(free & ~free.all(-1, keepdim=True))[..., None]
+    right = torch.where((right.sum(1, keepdim=True) >= 2), right, there)
+    joints = triangulate_all(maps, frame, right)
+    turn = torch.eye(3).to(rays).expand(*free.shape, 3, 3)
+    rotvec = rays.new_zeros(*free.shape, 3)
+    for width in _WIDTHS:
+        large = 1 + rotvec.square().sum(-1) / _TURN**2
+        prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
+        prior = prior[..., None].expand_as(rotvec).flatten(1)
+        ahead = rays @ turn.mT
+        pixels, by_ray = _pixels(ahead, maps)
+        T = -by_ray @ cross_matrix(ahead)
+        seen = see(maps, joints)
+        size = 0.5 * seen.by_joint.square().sum((-2, -1))
+        variance = width * (frame.variance + frame.relative * size)
+        r = pixels - seen.pixels
+        weight = frame.inlier * seen.in_front / (variance + r.square().sum(-1) / _FREEDOM)
+        A, r, w = seen.by_joint, r[..., None], weight[..., None, None]
+        W = (w * A).mT @ A
+        W = W.sum(1) + torch.eye(3).to(A) / _JOINT_STD**2
+        b = ((w * A).mT @ r).sum(1)
+        F = ((w * A).mT @ T).permute(0, 2, 3, 1, 4).flatten(-2)  # [N, J, 3, 3 C]
+        chol = torch.linalg.cholesky(W)
+        own = ((w * T).mT @ T).sum(2)
+        S = _block_diagonal(own) + torch.diag_embed(prior)
+        solved = torch.cholesky_solve(F, chol)
+        S = S - (F.mT @ solved).sum(1)
+        g = ((w * T).mT @ r).sum(2).flatten(1) - (solved.mT @ b).sum(1).squeeze(-1)
+        L = torch.linalg.cholesky((S + S.mT) / 2)
+        step = torch.cholesky_solve((-g - prior * rotvec.flatten(1))[..., None], L)
+        joints = joints + torch.cholesky_solve(b + F @ step[:, None], chol).squeeze(-1)
+        rotvec = rotvec + step.view_as(rotvec)
+        turn = rotvec_to_matrix(step.view_as(rotvec)) @ turn
+    narrowed = torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN)) * 1.5
+    narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - narrowed.sum(-1)
+    spent = 2 * torch.where(free, 1 + rotvec.square().sum(-1) / _TURN**2, 1.0).log().sum(-1)
+    return Turns(torch.where(free[..., None, None], turn, torch.eye(3).to(turn)), spent + narrowed)
+
+
+def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "N C J 3"]:
+    """Return the rays of keypoints in world axes, of depth 1."""
+    ones = torch.ones_like(frame.pixels[..., :1])
+    homogeneous = torch.cat([frame.pixels, ones], -1)
+    return torch.linalg.solve(maps.matrix, homogeneous.mT).mT
+
+
+def _pixels(
+    rays: Float[Tensor, "N C J 3"], maps: RigMaps
+) -> tuple[Float[Tensor, "N C J 2"], Float[Tensor, "N C J 2 3"]]:
+    """Return the pixels of rays, and their derivatives."""
+    homogeneous = rays @ maps.matrix.mT
+    depth = homogeneous[..., 2:]
+    depth = torch.where(depth > 0.1, depth, 0.1)
+    pixels = homogeneous[..., :2] / depth
+    rows = maps.matrix[:, None, :2] - pixels[..., None] * maps.matrix[:, None, 2:]
+    return pixels, rows / depth[..., None]
+
+
+def _block_diagonal(blocks: Float[Tensor, "N C 3 3"]) -> Float[Tensor, "N C3 C3"]:
+    """Return matrices with blocks on their diagonals."""
+    eye = torch.eye(blocks.shape[1]).to(blocks)
+    return (eye[:, None, :, None] * blocks[:, :, :, None]).flatten(-2).flatten(1, 2)
