@@ -2,9 +2,11 @@
 
 Recorded bodies in rings of cameras with a detector's faults (`benchmarks.keypoint_bodies.clips`), two scored
 clips of each set, 80 frames. Cameras begin up to four frames too early or too late; or all but one are turned
-by 1 degree about any axis and shifted by 2 cm; or both; or they are right.
+by 1 degree about any axis and shifted by 2 cm; or both; or they are right. With `--faulty`, one camera is much
+wrong: it stands still, was knocked over, is mirrored, or shows what another one sees.
 
     python -m benchmarks.keypoint_cameras --data DIR [--out FILE]
+    python -m benchmarks.keypoint_cameras --data DIR --faulty [--out FILE]
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from benchmarks._command import run_command
 from benchmarks._table_file import TableFile, save_text
 from benchmarks.keypoint_bodies.clips import CHOOSING, SCORED, Clip, read_clips
 from benchmarks.keypoint_cameras.disturbed import disturb
+from benchmarks.keypoint_cameras.faulty import add_faulty_cameras
 from benchmarks.keypoint_cameras.real import add_real_cameras
 from benchmarks.keypoint_cameras.ways import WAYS, Errors, measure
 from torchpose.evaluation import Report
@@ -45,6 +48,7 @@ def main(
     threads: int = 2,
     out: TableFile | None = None,
     choose: bool = False,
+    faulty: bool = False,
     quick: bool = False,
 ) -> None:
     """Print the tables.
@@ -54,6 +58,7 @@ def main(
         threads: cores.
         out: file for the same as Markdown, or a folder.
         choose: the clips on which constants are chosen, in place of those that are scored.
+        faulty: the tables of cameras that are much wrong, in place of those of slightly wrong ones.
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
@@ -62,9 +67,12 @@ def main(
     if quick:
         names = {k: v[:1] for k, v in list(names.items())[:1]}
     clips = [clip for group in read_clips(data, names).values() for clip in group]
-    for title, (late, turned, what) in _KINDS.items():
-        _add_table(report, title, clips, late, turned, what)
-    add_real_cameras(report, data)
+    if faulty:
+        add_faulty_cameras(report, clips, [n for n in _RIGS if n > 2])
+    else:
+        for title, (late, turned, what) in _KINDS.items():
+            _add_table(report, title, clips, late, turned, what)
+        add_real_cameras(report, data)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
     save_text(out, "\n\n".join(tables) + "\n")

@@ -197,6 +197,15 @@ def group_detections(
     return _disjoint(groups, torch.where(enough, score, -math.inf))
 
 
+def pairs_of_detections(frame: KeypointFrame) -> KeypointFrame:
+    """Return the keypoints [N, C, J] of all pairs of detections of two cameras.
+
+    Args:
+        frame: [D, C, J].
+    """
+    return taken_detections(frame, _pairs(((frame.inlier > 0).sum(-1) >= LEAST_JOINTS).mT))
+
+
 def _pairs(free: Bool[Tensor, "C D"]) -> Int[Tensor, "H C"]:
     """Return all pairs of detections of two cameras, -1 in the other cameras."""
     found = []

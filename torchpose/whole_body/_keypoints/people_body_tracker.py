@@ -13,6 +13,7 @@ from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_units import check_units
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_body_tracker import SMOOTHING, KeypointBodyTracker
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import (
@@ -20,6 +21,7 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     stacked,
 )
 from torchpose.whole_body._keypoints.nested import taken
+from torchpose.whole_body._keypoints.people_association import pairs_of_detections
 from torchpose.whole_body._keypoints.people_tracker import (
     PeopleFrame,
     PeopleStream,
@@ -27,6 +29,8 @@ from torchpose.whole_body._keypoints.people_tracker import (
 )
 
 ALL_PERSONS = "all"
+_FRAMES = 20  # that are looked at, at most, where nobody is found
+_AGREED = 0.7  # share of the joints of two detections, from which on they are of one person
 
 
 class _Row(NamedTuple):
@@ -85,6 +89,8 @@ class PeopleBodyTracker:
         identities = [int(one[-1].frame.identity[one[-1].row]) for one in persons]
         named = sorted((who, i) for i, who in enumerate(identities) if who > 0)
         self._check_units([row for _, i in named for row in persons[i]])
+        if not named:
+            self._check_units_of_pairs(frames)
         return [self._track(persons[i], who, smoothing == "full") for who, i in named]
 
     @torch.no_grad()
@@ -127,6 +133,28 @@ class PeopleBodyTracker:
         if rows:
             seen = [taken(one.frame.keypoints, torch.tensor([one.row])) for one in rows]
             check_units(self.single.tracker.filter, stacked(seen))
+
+    def _check_units_of_pairs(self, frames: KeypointFrame) -> None:
+        """Raise `CameraError` where nobody is found since cameras are not in metres.
+
+        Any two detections of two cameras that agree on joints are taken for a person's.
+
+        Args:
+            frames: [T, D, C, J].
+        """
+        filter = self.single.tracker.filter
+        if len(filter.maps.shift) == 1:
+            return
+        stride = max(1, len(frames.pixels) // _FRAMES)
+        pairs = [
+            pairs_of_detections(frames.map(lambda value: value[t]))  # noqa: B023
+            for t in range(0, len(frames.pixels), stride)
+        ]
+        found = KeypointFrame(*(torch.cat(values) for values in zip(*pairs, strict=True)))
+        agreed = triangulate(filter.maps, found).isfinite().all(-1).sum(-1)
+        both = ((found.inlier > 0).sum(1) >= 2).sum(-1)
+        rows = (agreed > _AGREED * both).nonzero().squeeze(-1)
+        check_units(filter, found.take(rows).map(lambda value: value[:, None]))
 
     def _track(
         self, rows: Sequence[_Row], person: int, smoothing: bool = False, summed_up: bool = True
