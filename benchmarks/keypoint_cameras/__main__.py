@@ -2,8 +2,8 @@
 
 Recorded bodies in rings of cameras with a detector's faults (`benchmarks.keypoint_bodies.clips`), two scored
 clips of each set, 80 frames. Cameras begin up to four frames too early or too late; or all but one are turned
-by 1 degree about any axis and shifted by 2 cm; or both; or they are right. With `--faulty`, one camera is much
-wrong: it stands still, was knocked over, is mirrored, or shows what another one sees.
+by 1 degree about any axis and shifted by 2 cm; or both; or they are right. With `--faulty`, cameras are
+much wrong: one stands still, was knocked over, or is mirrored, or all are turned; one clip of each set.
 
     python -m benchmarks.keypoint_cameras --data DIR [--out FILE]
     python -m benchmarks.keypoint_cameras --data DIR --faulty [--out FILE]
@@ -68,7 +68,7 @@ def main(
         names = {k: v[:1] for k, v in list(names.items())[:1]}
     clips = [clip for group in read_clips(data, names).values() for clip in group]
     if faulty:
-        add_faulty_cameras(report, clips, [n for n in _RIGS if n > 2])
+        add_faulty_cameras(report, clips[::_EACH], [n for n in _RIGS if n > 2])
     else:
         for title, (late, turned, what) in _KINDS.items():
             _add_table(report, title, clips, late, turned, what)

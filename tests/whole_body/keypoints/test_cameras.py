@@ -171,7 +171,9 @@ def test_notes_say_what_was_not_asked_for(right):
     assert len(late) == 1 and "camera c2 seems to have begun" in late[0]
     assert "earlier than c0" in late[0] and "--refine delays" in late[0]
     turned = track(right, disturbed(right.rig, 1, 1.5, 0.02)).notes
-    assert len(turned) == 1 and "camera c1 (by 1." in turned[0] and "--refine extrinsics" in turned[0]
+    assert (
+        len(turned) == 1 and "camera c1 (by 1." in turned[0] and "--refine extrinsics" in turned[0]
+    )
 
 
 def test_a_refined_track_is_saved_and_read(in_step, tmp_path):

@@ -320,7 +320,9 @@ def test_a_camera_whose_video_stands_still_is_named():
     pixels[5:, 2] = pixels[5, 2]
     there = torch.ones(pixels.shape[:3], dtype=torch.bool)
     (note,) = notes_on_still_cameras(("a", "b", "c"), pixels, there, 10)
-    assert note.startswith("the keypoints of camera c are exactly the same in frames 15 to 49, which")
+    assert note.startswith(
+        "the keypoints of camera c are exactly the same in frames 15 to 49, which"
+    )
     found = BodyTracker(ring(3), "kalman", fps=FPS)(keypoints=pixels)
     assert any("camera c2 are exactly the same in frames 5 to 39" in n for n in found.notes)
     everything = pixels[:1].expand_as(pixels)  # a person who does not move at all

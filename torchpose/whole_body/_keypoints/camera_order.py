@@ -4,37 +4,17 @@ from collections.abc import Sequence
 from itertools import combinations, permutations
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from torchpose.whole_body._keypoints.joint_triangulation import agreeing
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
 _FRAMES = 20  # that are looked at, at most
 _EVERY_ORDER = 4  # cameras, of which every order is tried; of more, exchanges of two
-_ASTRAY = 0.5  # share of a camera's keypoints that are not of the body, from which on orders are tried
-_TURN = 0.1  # radians by which a camera seems to be turned, from which on they are
 _AGREED = 0.7  # share of the keypoints that cameras have to agree on in another order
 _MORE = 0.25  # by how much that is more than in the order of the inputs, and in any other
 
 
-def astray(
-    inlier: Float[Tensor, "T C J"], turns: Float[Tensor, "T C"], there: Bool[Tensor, "T C J"]
-) -> bool:
-    """Return whether a camera sees something else than the body.
-
-    Args:
-        inlier: probability that keypoints are of the body. turns: radians by which cameras seem to be turned.
-        there: which keypoints there are.
-    """
-    count = there.sum((0, 2))
-    share = inlier.sum((0, 2)) / count.clamp_min(1)
-    return bool(((share < 1 - _ASTRAY) & (count > 0)).any() | (turns > _TURN).any())
-
-
-def notes_on_order(
-    names: Sequence[str], maps: RigMaps, frames: KeypointFrame
-) -> tuple[str, ...]:
+def notes_on_order(names: Sequence[str], maps: RigMaps, frames: KeypointFrame) -> tuple[str, ...]:
     """Return a note if keypoints agree far better in another order of the inputs.
 
     Args:
@@ -55,8 +35,8 @@ def notes_on_order(
     fits = ", ".join(f"input {orders[best][c] + 1} is of {names[c]}" for c in range(count))
     return (
         f"inputs seem to be in another order than the cameras: cameras agree on {100 * first:.0f} % of the "
-        f"keypoints if {fits}, and on {100 * float(share[0]):.0f} % as they are given; give them in the order "
-        "of the cameras",
+        f"keypoints if {fits}, and on {100 * float(share[0]):.0f} % as they are given; give them in the "
+        "order of the cameras",
     )
 
 

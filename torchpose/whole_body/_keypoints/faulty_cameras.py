@@ -1,4 +1,4 @@
-"""Notice cameras that are turned, that see something else, or whose video stands still, and track without that.
+"""Notice cameras that are turned, see something else, or whose video stands still, and track without that.
 
 A camera is watched by the share of its keypoints that are those of the body. Where it stays low, bodies begin
 anew with the keypoints of that frame under several explanations: cameras are right; one, or all, are turned
@@ -34,7 +34,9 @@ from torchpose.whole_body._keypoints.turned_cameras import find_turns, turned
 
 LEAST_CAMERAS = 3
 LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
-_PATIENCE = 0.5  # seconds for which a camera sees something else before an explanation is looked for
+_PATIENCE = (
+    0.5  # seconds for which a camera sees something else before an explanation is looked for
+)
 _PAUSE = 5.0  # seconds until the next search, where none was found
 _WIDE = 2.0  # factor of the noise's variance, above which a camera may be wrong
 _LEAST_GAIN = 10.0  # log-evidence by which an explanation must be better than right cameras
@@ -138,22 +140,19 @@ def find_faults(
     return after, plain.put(rows, found.take(best[rows])), better | faults.wrong
 
 
-def _explanations(
-    frame: KeypointFrame, maps: RigMaps
-) -> tuple[CameraFaults, Float[Tensor, " N"]]:
+def _explanations(frame: KeypointFrame, maps: RigMaps) -> tuple[CameraFaults, Float[Tensor, " N"]]:
     """Return explanations of frames, those of one after the other, and what they cost in log-evidence."""
     count, n_cameras = frame.inlier.shape[:2]
     one = torch.eye(n_cameras, dtype=torch.bool, device=frame.inlier.device)
     free = torch.cat([one, torch.ones_like(one[:1])])
-    off = [one]
+    some_off = [one]
     if 3 < n_cameras <= _MOST_PAIRS:
         pairs = [list(pair) for pair in combinations(range(n_cameras), 2)]
-        off.append(torch.stack([~one[pair].any(0) for pair in pairs]))
-    off = torch.cat(off)
+        some_off.append(torch.stack([~one[pair].any(0) for pair in pairs]))
+    off = torch.cat(some_off)
     none = torch.zeros_like
     free, off = (
-        torch.cat(parts).repeat(count, 1)
-        for parts in ((free, none(off)), (none(free), off))
+        torch.cat(parts).repeat(count, 1) for parts in ((free, none(off)), (none(free), off))
     )
     n = len(free) // count
     rows = torch.arange(count, device=free.device).repeat_interleave(n)
@@ -162,7 +161,9 @@ def _explanations(
     turns = find_turns(frame.take(rows[some]), free[some], maps)
     price = frame.inlier.new_zeros(len(free)).index_copy(0, some, turns.price)
     tried = tried._replace(
-        turn=tried.turn.index_copy(0, some, turns.matrix), off=off, wrong=torch.ones_like(tried.wrong)
+        turn=tried.turn.index_copy(0, some, turns.matrix),
+        off=off,
+        wrong=torch.ones_like(tried.wrong),
     )
     return tried, price
 

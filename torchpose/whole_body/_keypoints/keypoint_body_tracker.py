@@ -28,13 +28,13 @@ from torchpose.whole_body._keypoints.camera_notes import (
     notes_on_cameras,
     notes_on_refined,
 )
+from torchpose.whole_body._keypoints.camera_order import notes_on_order
 from torchpose.whole_body._keypoints.camera_refinement import (
     REFINED,
     RefinedCameras,
     details_of_cameras,
     refine_cameras,
 )
-from torchpose.whole_body._keypoints.camera_order import astray, notes_on_order
 from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import (
@@ -378,10 +378,9 @@ class KeypointBodyTracker(nn.Module):
             return notes + rolled
         if len(self.rig) == 1 or not cameras:
             return notes
-        if astray(poses.inlier, poses.turns, there):
-            order = notes_on_order(self.rig.names, self.tracker.filter.maps, frame)
-            if order:
-                return (*order, *notes)
+        order = notes_on_order(self.rig.names, self.tracker.filter.maps, frame)
+        if order:
+            return (*order, *notes)
         rig = self.rig if refined is None else refined.rig
         exchange = self.tracker.filter.exchange
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)

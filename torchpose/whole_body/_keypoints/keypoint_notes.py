@@ -14,8 +14,10 @@ TOO_FEW = "too few keypoints were given"
 _DISAGREES = 0.5  # share of a camera's keypoints that are nobody's, above which it is said
 _MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
 _GAP = 30  # frames without keypoints that are worth a word
-_LEAST_TURN = 0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
-_LEANS = 12.0  # degrees by which a trunk leans in most images of a camera that may be rolled
+_LEAST_TURN = (
+    0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
+)
+_LEANS = 8.0  # degrees by which trunk and legs lean in most images of a camera that may be rolled
 
 
 def late_note(first_frame: int, why: str) -> tuple[str, ...]:
@@ -160,18 +162,31 @@ def notes_on_a_rolled_camera(
     Args:
         name: of the camera. pixels: of keypoints. there: which there were.
     """
-    low, top = (BODY_15.joint(joint) for joint in ("pelvis", "neck"))
-    axis = (pixels[:, top] - pixels[:, low])[there[:, top] & there[:, low]]
-    if len(axis) < _GAP:
-        return ()
-    lean = torch.rad2deg(torch.atan2(axis[:, 0], -axis[:, 1])).median()
-    if abs(float(lean)) < _LEANS:
+    trunk = _lean(pixels, there, "neck", ("left_hip", "right_hip"))
+    legs = _lean(pixels, there, "pelvis", ("left_ankle", "right_ankle"))
+    leans = min(abs(trunk), abs(legs))
+    if trunk * legs <= 0 or leans < _LEANS:
         return ()
     return (
-        f"the person leans by {abs(float(lean)):.0f} degrees in most images of camera {name}, which is taken "
+        f"the person leans by {leans:.0f} degrees or more in most images of camera {name}, which is taken "
         "to be level since no up is given; if the camera is rolled, or its video turned, give up (--up), the "
         "axis of the world that points up, or turn the images",
     )
+
+
+def _lean(
+    pixels: Float[Tensor, "T J 2"], there: Bool[Tensor, "T J"], top: str, low: tuple[str, str]
+) -> float:
+    """Return by how many degrees a joint is to the right above the middle of two, 0 if few frames tell.
+
+    It is the median over frames.
+    """
+    joints = [BODY_15.joint(joint) for joint in (top, *low)]
+    above, *below = pixels[there[:, joints].all(-1)][:, joints].unbind(1)
+    if len(above) < _GAP:
+        return 0.0
+    axis = above - torch.stack(below).mean(0)
+    return float(torch.rad2deg(torch.atan2(axis[:, 0], -axis[:, 1])).median())
 
 
 def _runs(flags: Bool[Tensor, " T"]) -> list[tuple[int, int]]:

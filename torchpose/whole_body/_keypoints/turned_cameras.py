@@ -1,8 +1,8 @@
 """Find by how much cameras are turned, from the keypoints of one frame, with its joints eliminated.
 
 A camera that is turned about its centre sees z where it should see z' = M exp([w]x) M^-1 z, with M = K R.
-So the keypoints of such a camera are corrected, and the cameras stay as they are. Unknown are w of the cameras
-that may be turned and the joints p. Steps of Gauss and Newton minimise
+So the keypoints of such a camera are corrected, and the cameras stay as they are. Unknown are the joints p
+and w of the cameras that may be turned. Steps of Gauss and Newton minimise
 
     nu/2 sum_cj log(1 + |z'_cj - h_c(p_j)|^2 / (nu R_cj)) + 2 sum_c log(1 + |w_c|^2 / s^2)
 
@@ -39,9 +39,7 @@ class Turns(NamedTuple):
     price: Tensor
 
 
-def turned(
-    frame: KeypointFrame, turn: Float[Tensor, "B C 3 3"], maps: RigMaps
-) -> KeypointFrame:
+def turned(frame: KeypointFrame, turn: Float[Tensor, "B C 3 3"], maps: RigMaps) -> KeypointFrame:
     """Return keypoints as cameras would see them that are not turned.
 
     Args:
@@ -50,52 +48,71 @@ def turned(
     return frame._replace(pixels=_pixels(_rays(frame, maps) @ turn.mT, maps)[0])
 
 
-def find_turns(
-    frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps
-) -> Turns:
+def find_turns(frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps) -> Turns:
     """Return the turns of cameras that explain the keypoints of a frame.
 
     Args:
-        frame: the keypoints [N, C, J]. free: which cameras may be turned. maps: the cameras.
+        frame: the keypoints. free: which cameras may be turned. maps: the cameras.
     """
-    rays, there = _rays(frame, maps), frame.inlier > 0
-    right = there & ~(free & ~free.all(-1, keepdim=True))[..., None]
-    right = torch.where((right.sum(1, keepdim=True) >= 2), right, there)
-    joints = triangulate_all(maps, frame, right)
-    turn = torch.eye(3).to(rays).expand(*free.shape, 3, 3)
-    rotvec = rays.new_zeros(*free.shape, 3)
+    rays = _rays(frame, maps)
+    joints = _first_joints(frame, free, maps)
+    eye = torch.eye(3).to(rays)
+    turn, rotvec = eye.expand(*free.shape, 3, 3), rays.new_zeros(*free.shape, 3)
     for width in _WIDTHS:
         large = 1 + rotvec.square().sum(-1) / _TURN**2
         prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
         prior = prior[..., None].expand_as(rotvec).flatten(1)
-        ahead = rays @ turn.mT
-        pixels, by_ray = _pixels(ahead, maps)
-        T = -by_ray @ cross_matrix(ahead)
-        seen = see(maps, joints)
-        size = 0.5 * seen.by_joint.square().sum((-2, -1))
-        variance = width * (frame.variance + frame.relative * size)
-        r = pixels - seen.pixels
-        weight = frame.inlier * seen.in_front / (variance + r.square().sum(-1) / _FREEDOM)
-        A, r, w = seen.by_joint, r[..., None], weight[..., None, None]
-        W = (w * A).mT @ A
-        W = W.sum(1) + torch.eye(3).to(A) / _JOINT_STD**2
-        b = ((w * A).mT @ r).sum(1)
-        F = ((w * A).mT @ T).permute(0, 2, 3, 1, 4).flatten(-2)  # [N, J, 3, 3 C]
-        chol = torch.linalg.cholesky(W)
-        own = ((w * T).mT @ T).sum(2)
-        S = _block_diagonal(own) + torch.diag_embed(prior)
-        solved = torch.cholesky_solve(F, chol)
-        S = S - (F.mT @ solved).sum(1)
-        g = ((w * T).mT @ r).sum(2).flatten(1) - (solved.mT @ b).sum(1).squeeze(-1)
-        L = torch.linalg.cholesky((S + S.mT) / 2)
+        chol, F, b, S, g = _equations(frame, rays @ turn.mT, joints, maps, width)
+        L = torch.linalg.cholesky((S + S.mT) / 2 + torch.diag_embed(prior))
         step = torch.cholesky_solve((-g - prior * rotvec.flatten(1))[..., None], L)
         joints = joints + torch.cholesky_solve(b + F @ step[:, None], chol).squeeze(-1)
         rotvec = rotvec + step.view_as(rotvec)
         turn = rotvec_to_matrix(step.view_as(rotvec)) @ turn
-    narrowed = torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN)) * 1.5
-    narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - narrowed.sum(-1)
+    known = 1.5 * torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN))
+    narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - known.sum(-1)
     spent = 2 * torch.where(free, 1 + rotvec.square().sum(-1) / _TURN**2, 1.0).log().sum(-1)
-    return Turns(torch.where(free[..., None, None], turn, torch.eye(3).to(turn)), spent + narrowed)
+    return Turns(torch.where(free[..., None, None], turn, eye), spent + narrowed)
+
+
+def _first_joints(
+    frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps
+) -> Float[Tensor, "N J 3"]:
+    """Return joints by the cameras that are not turned, or by all where too few see them."""
+    there = frame.inlier > 0
+    right = there & ~(free & ~free.all(-1, keepdim=True))[..., None]
+    right = torch.where(right.sum(1, keepdim=True) >= 2, right, there)
+    return triangulate_all(maps, frame, right)
+
+
+def _equations(
+    frame: KeypointFrame,
+    rays: Float[Tensor, "N C J 3"],
+    joints: Float[Tensor, "N J 3"],
+    maps: RigMaps,
+    width: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return a factor of the information about joints, and the normal equations with them eliminated.
+
+    Returns:
+        The factor [N, J, 3, 3], F [N, J, 3, 3 C] and b [N, J, 3, 1] of the joints; S [N, 3 C, 3 C] and g
+        [N, 3 C] of the turns.
+    """
+    pixels, by_ray = _pixels(rays, maps)
+    T = -by_ray @ cross_matrix(rays)
+    seen = see(maps, joints)
+    A, off = seen.by_joint, pixels - seen.pixels
+    size = 0.5 * A.square().sum((-2, -1))
+    variance = width * (frame.variance + frame.relative * size)
+    weight = frame.inlier * seen.in_front / (variance + off.square().sum(-1) / _FREEDOM)
+    w, r = weight[..., None, None], off[..., None]
+    Aw, Tw = (w * A).mT, (w * T).mT
+    chol = torch.linalg.cholesky((Aw @ A).sum(1) + torch.eye(3).to(A) / _JOINT_STD**2)
+    b = (Aw @ r).sum(1)
+    F = (Aw @ T).permute(0, 2, 3, 1, 4).flatten(-2)
+    solved = torch.cholesky_solve(F, chol)
+    S = _block_diagonal((Tw @ T).sum(2)) - (F.mT @ solved).sum(1)
+    g = (Tw @ r).sum(2).flatten(1) - (solved.mT @ b).sum(1).squeeze(-1)
+    return chol, F, b, S, g
 
 
 def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "N C J 3"]:

@@ -1,0 +1,148 @@
+"""Cameras that stand still, are turned, or see somebody else are noticed, and do not draw the body away."""
+
+import math
+
+import pytest
+import torch
+
+from tests.whole_body.keypoints.scenes import (
+    FPS,
+    NAMES,
+    camera_at,
+    errors,
+    moving_body,
+    ring,
+    scene,
+)
+from torchpose import BodyTracker
+from torchpose.camera import CameraRig
+from torchpose.errors import CameraError
+from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults, without_still
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_notes import notes_on_a_rolled_camera
+from torchpose.whole_body._keypoints.turned_cameras import find_turns, turned
+
+
+@pytest.fixture(scope="module")
+def three():
+    return scene(3, n_frames=22)
+
+
+def track(keypoints, rig):
+    return BodyTracker(rig, "kalman", fps=FPS)(keypoints=keypoints, names=NAMES)
+
+
+def with_turn(rig: CameraRig, camera: int, degrees: float) -> CameraRig:
+    """A rig of which one camera is said to be turned about its x axis by so much more."""
+    other = ring(len(rig))
+    turn = rotvec_to_matrix(torch.tensor([math.radians(degrees), 0.0, 0.0]).double())
+    other.rotation[camera] = turn @ rig.rotation[camera]
+    other.translation[camera] = turn @ rig.translation[camera]
+    return other
+
+
+def frame_of(keypoints) -> KeypointFrame:
+    """A frame [1, C, J] of keypoints [C, J, 2]."""
+    ones = torch.ones_like(keypoints[None, ..., 0])
+    return KeypointFrame(keypoints[None], ones, 1e-4 * ones, 0.9 * ones)
+
+
+def test_turns_are_found_and_keypoints_turned_back(three):
+    rig = with_turn(three.rig, 1, 5.0)
+    maps, frame = RigMaps.of(rig), frame_of(rig(three.joints).pixels[0])
+    wrong = frame._replace(pixels=three.rig(three.joints).pixels[:1])
+    found = find_turns(wrong, torch.tensor([[False, True, False]]), maps)
+    cosine = (found.matrix.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    assert torch.rad2deg(cosine.clamp(-1, 1).arccos())[0].tolist() == pytest.approx(
+        [0.0, 5.0, 0.0], abs=0.05
+    )
+    back = turned(wrong, found.matrix, maps)
+    assert float((back.pixels - frame.pixels).abs().max()) < 1.5
+
+
+@pytest.mark.parametrize("degrees", [1.5, 20.0])
+def test_a_turned_camera_of_three_hardly_moves_the_body(three, degrees):
+    found = track(three.keypoints, with_turn(three.rig, 1, degrees))
+    assert float(errors(found, three.joints)[10:].mean()) < 0.03
+    assert any(f"camera c1 (by {degrees:.0f}"[:-1] in note for note in found.notes)
+
+
+def test_cameras_that_are_all_turned_agree_again(three):
+    rig = three.rig
+    for camera, degrees in enumerate((3.0, -3.0, 3.0)):
+        rig = with_turn(rig, camera, degrees)
+    found = track(three.keypoints, rig)
+    assert float(found.details["inlier"][10:].mean()) > 0.8
+    assert any("against the calibration" in note for note in found.notes)
+
+
+def test_right_cameras_stay_as_they_are(three):
+    found = track(three.keypoints, three.rig)
+    assert found.notes == () and not found.respread.any()
+
+
+def test_a_camera_that_stands_still_is_not_used(three):
+    keypoints = three.keypoints.clone()
+    keypoints[8:, 2] = keypoints[8, 2]
+    found = track(keypoints, three.rig)
+    two = track(three.keypoints[:, :2], three.rig.select([0, 1]))
+    assert float(errors(found, three.joints)[10:].mean()) < 1.2 * float(
+        errors(two, three.joints)[10:].mean()
+    )
+    assert float(found.details["inlier"][9:, 2].max()) == 0.0
+    tracker = BodyTracker(three.rig, "kalman", fps=FPS)
+    stream = tracker.init(names=NAMES)
+    for t in range(12):
+        stream, live = tracker.step(stream, keypoints=keypoints[t])
+    torch.testing.assert_close(live.joints3d[0], found.joints3d[11])
+
+
+def test_everything_that_stands_still_is_used(three):
+    frame = frame_of(three.keypoints[0])
+    faults = CameraFaults.none(frame)._replace(pixels=frame.pixels, inlier=frame.inlier)
+    assert bool((without_still(frame, faults).inlier > 0).all())
+
+
+def test_a_camera_that_sees_somebody_else_is_left_out_and_comes_back():
+    seen = scene(4, n_frames=38)
+    keypoints, other = seen.keypoints.clone(), scene(4, n_frames=38, height=1.1)
+    keypoints[6:22, 1] = 400.0 + 0.5 * other.keypoints[6:22, 3].flip(1)
+    found = track(keypoints, seen.rig)
+    assert float(errors(found, seen.joints).mean()) < 0.03
+    assert float(found.details["inlier"][10:20, 1].mean()) < 0.5
+    assert float(found.details["inlier"][33:, 1].mean()) > 0.7
+
+
+@pytest.mark.parametrize("order", [(1, 0), (0, 2, 1), (3, 1, 2, 0)])
+def test_another_order_of_the_inputs_is_said(order):
+    places = [(0.6, 4.0), (2.0, 3.1), (3.9, 4.6), (5.5, 3.6)][: len(order)]
+    rig = CameraRig([camera_at(*place, f"c{i}") for i, place in enumerate(places)])
+    pixels = rig(moving_body() + torch.tensor([0.6, 0.1, 0.3])).pixels
+    frame = frame_of(pixels[0])
+    frames = frame.map(lambda value: value.repeat(len(pixels), *[1] * (value.ndim - 1)))
+    right = frames._replace(pixels=pixels)
+    frames = frames._replace(pixels=pixels[:, list(order)])
+    names, maps = [f"c{i}" for i in range(len(order))], RigMaps.of(rig)
+    (note,) = notes_on_order(names, maps, frames)
+    for camera, given in enumerate(order):
+        assert f"input {camera + 1} is of c{given}" in note
+    assert notes_on_order(names, maps, right) == ()
+
+
+def test_a_rolled_camera_by_itself_is_said():
+    seen = scene(1)
+    pixels, there = seen.keypoints[:, 0], torch.ones((*seen.keypoints.shape[:1], 15)) > 0
+    assert notes_on_a_rolled_camera("a", pixels, there) == ()
+    quarter = torch.stack([1080 - pixels[..., 1], pixels[..., 0]], -1)
+    (note,) = notes_on_a_rolled_camera("a", quarter, there)
+    assert "leans by" in note and "--up" in note
+
+
+def test_several_persons_in_cameras_in_other_units_are_refused(three):
+    far = ring(3)
+    far.translation.mul_(15)
+    tracker = BodyTracker(far, "kalman", fps=FPS)
+    with pytest.raises(CameraError, match="metres"):
+        tracker(keypoints=three.keypoints[:, :, None], names=NAMES, persons="all")
