@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from torchpose.measure._grid_filter import exclude, predict, read_out
+from torchpose.measure._grid_filter import exclude, predict, read_out, without_jumps
 
 H, W = 7, 9
 RNG = np.random.default_rng(0)
@@ -110,6 +110,32 @@ def test_two_hands_do_not_take_one_place():
     peak[:, :, 10, 8], peak[:, :, 10, 22] = 1.0, 0.8
     found = exclude(peak, 2.5, 3.0, 2.8, 1.5, torch.ones(1, 2))
     assert found[0, 0, 10, 22] > 0.8 and found[0, 1, 10, 8] > 0.8  # the left hand is on the right
+
+
+def test_a_jump_to_the_other_hand_is_the_product_over_cells():
+    predicted, present = beliefs(5).square(), torch.tensor([[0.9, 0.6], [1.0, 0.3]])
+    predicted = predicted / predicted.sum((2, 3), keepdim=True)
+    found = without_jumps(predicted, 5.0, 1.4, present)
+    for n in range(2):
+        own = [
+            brute_blur(p, 1.4) * 1.2 * 2 * math.pi * 1.4**2 for p in predicted[n].double().numpy()
+        ]
+        near, seen = [np.clip(p, 0, 1) for p in own], present[n].tolist()
+        for k in range(2):
+            jump = 1 - np.exp(-5.0 * seen[k] * (near[k].max() - near[k]))
+            expected = predicted[n, k].numpy() * (1 - seen[1 - k] * near[1 - k] * jump)
+            np.testing.assert_allclose(found[n, k], expected, atol=2e-6)
+
+
+def test_a_hand_jumps_to_the_other_one_only_if_its_place_was_unknown():
+    there = torch.full((4, 2, 20, 30), 1e-4)
+    there[:, 0, 10, 8] = there[:2, 1, 10, 22] = 1.0  # the second one is hidden
+    there[3, 1, 10, 9] = 1.0  # it was here, nobody knows where the third right hand was
+    there = there / there.sum((2, 3), keepdim=True)
+    present = torch.tensor([[1.0, 1.0], [1.0, 0.0], [1.0, 1.0], [1.0, 1.0]])
+    kept = (without_jumps(there, 5.0, 3.0, present) / there)[:, 1, 10, 8]
+    assert kept[0] < 0.02
+    assert (kept[1:] > 0.9).all()
 
 
 def test_read_out_is_mean_covariance_and_mass_near_the_mode():

@@ -10,6 +10,7 @@ from torchpose.errors import InputError, ShapeError
 from torchpose.measure import HandTracker
 from torchpose.measure._body_window import CELLS, cell_centres
 from torchpose.measure._hand_likelihood import HandLikelihood, HandSettings
+from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._hands import HandState
 
@@ -190,6 +191,49 @@ def test_a_dark_room_is_like_a_bright_one(prior, clip, tracked):
     _, out = follow(HandTracker(prior), dark, [(320.0, 120.0, 76.0)])
     apart = torch.cat([one.points - two.points for one, two in zip(out, tracked[1], strict=True)])
     assert float(apart[5:].norm(dim=-1).max()) < 0.15 * 76
+
+
+class OneHandForTwo(HandNetwork):
+    """A network that takes a hand for either one once the right hand is covered."""
+
+    def __init__(self, hands, covered_from):
+        super().__init__()
+        away = cell_centres() - torch.tensor(hands, dtype=torch.float32)[:, None, None]
+        peak = torch.exp(-0.5 * (away / 0.15).square().sum(-1)) + 1e-4
+        peak[:, cell_centres()[..., 1] < 0.8] = 1e-6  # no hand at the face
+        self.left, self.right = (p / p.sum() for p in peak)
+        self.covered_from, self.frame = covered_from, 0
+
+    def see_colours(self, lab, inside, faces):
+        return torch.zeros(len(lab), 1, 44, 48)
+
+    def find(self, *inputs):
+        covered = self.frame >= self.covered_from
+        right = 0.8 * self.left + 0.2 * self.right if covered else self.right
+        self.frame += 1
+        places = torch.stack([self.left, right])[None].log()
+        odds = torch.tensor([[-3.0, -0.3 if covered else -3.0]])
+        return HandPlaces(places, odds, places, odds)
+
+
+def test_a_hand_that_is_covered_is_not_measured_at_the_other_one(prior):
+    face, hands = (320.0, 120.0, 76.0), hands_at(0)
+    image = scene(0)
+    covered = image.copy()
+    cv2.circle(covered, tuple(int(v) for v in hands[1].round()), 28, CLOTH, -1)
+    frames = [image] * 5 + [covered] * 10
+    away = []
+    for cost in (0.0, HandSettings().jump_to_other):
+        network = OneHandForTwo((hands - face[:2]) / face[2], covered_from=5)
+        tracker = HandTracker(prior, HandSettings(jump_to_other=cost, still=1.0), network=network)
+        _, out = follow(tracker, frames, [face])
+        away.append([(h.points[0, 1] - torch.from_numpy(hands[0])).norm() / face[2]
+                     if h.seen[0, 1] else torch.tensor(torch.inf) for h in out])  # fmt: skip
+        left = torch.stack([h.points[0, 0] for h in out[5:]])
+        assert (left - torch.from_numpy(hands[0])).norm(dim=-1).max() < 0.3 * face[2]
+    free, held = torch.tensor(away)
+    assert free.min() < 0.7  # what the network alone says
+    assert held.min() > 1
 
 
 def test_hands_out_of_the_image_are_not_seen(prior):

@@ -105,6 +105,27 @@ def _whole_grid(height: int, width: int) -> tuple[Tensor, Tensor]:
     return start.contiguous(), scale.contiguous()
 
 
+def without_jumps(
+    predicted: Float[Tensor, "N 2 h w"], cost: float, reach: float, present: Float[Tensor, "N 2"]
+) -> Float[Tensor, "N 2 h w"]:
+    """Return the predictions of both hands, less likely where one could only have jumped to the other.
+
+        p'_k(x) = p_k(x) (1 - v_l near_l(x) (1 - exp(-J v_k (max_y near_k(y) - near_k(x)))))
+
+    near_k is the predicted probability of a hand within about `reach` of x. A hand that was seen elsewhere
+    has to move to the other hand l, however much the place of l looks like a hand. One whose place was
+    not known, or that was not visible, may appear there.
+
+    Args:
+        predicted: p, each sums to one. cost: J, nats. reach: cells.
+        present: v, the probability that each hand is visible.
+    """
+    there = present[..., None, None]
+    near = _mass_near(predicted, reach, predicted.sum((2, 3), keepdim=True))
+    jump = near.amax((2, 3), keepdim=True).sub(near).mul_(-cost * there).expm1_()
+    return jump.mul_((near * there).flip(1)).add_(1).mul_(predicted)
+
+
 def exclude(
     base: Float[Tensor, "N 2 h w"],
     exclusion: float,
@@ -146,9 +167,15 @@ def _occupied(
     """Return taken_l and wrong_l of `exclude`."""
     columns = other.sum(1, keepdim=True)
     total = columns.sum(2, keepdim=True)
-    near = blur(other, radius).mul_(1.2 * 2 * math.pi * radius * radius / total).clamp_(0, 1)
     wrong = (columns @ _side_matrix(other.shape[2], soft, hand)).div_(total)
-    return near, wrong
+    return _mass_near(other, radius, total), wrong
+
+
+def _mass_near(
+    belief: Float[Tensor, "*batch h w"], radius: float, total: Float[Tensor, "*batch 1 1"]
+) -> Float[Tensor, "*batch h w"]:
+    """Return the share of each belief within about a radius of every cell."""
+    return blur(belief, radius).mul_(1.2 * 2 * math.pi * radius * radius / total).clamp_(0, 1)
 
 
 @cache

@@ -21,7 +21,13 @@ from torchpose.measure._body_window import (
     move_maps,
     pixels_to_cells,
 )
-from torchpose.measure._grid_filter import exclude, gaussian_bump, predict, read_out
+from torchpose.measure._grid_filter import (
+    exclude,
+    gaussian_bump,
+    predict,
+    read_out,
+    without_jumps,
+)
 from torchpose.measure._hand_elbows import expected_elbows, find_elbows, in_frame
 from torchpose.measure._hand_likelihood import (
     HandLikelihood,
@@ -82,6 +88,8 @@ class HandTracker(nn.Module):
 
     With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
     image. That is a state of its own, beside the places, with a probability that is filtered over time.
+    The network takes either hand for the other one, so a hand that was seen elsewhere comes to the other
+    one by moving only (`without_jumps`).
     The network also finds the elbows, in each frame alone.
 
     `step` is `look`, which the images and faces alone decide and which may run ahead, and then `find`.
@@ -333,12 +341,13 @@ class HandTracker(nn.Module):
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()
-        exclusion, crossing = s.exclusion, s.crossing
+        exclusion, crossing, present = s.exclusion, s.crossing, 1 - state.gone
         if self.network is not None:
             exclusion, crossing = s.exclusion_beside_network, s.crossing_beside_network
+            predicted = without_jumps(predicted, s.jump_to_other, s.jump_reach / CELL, present)
         return exclude(
             predicted * weight, exclusion, s.exclusion_radius / CELL,
-            crossing, s.crossing_soft / CELL, 1 - state.gone,
+            crossing, s.crossing_soft / CELL, present,
         )  # fmt: skip
 
     def _measure(
