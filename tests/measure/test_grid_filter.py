@@ -115,15 +115,19 @@ def test_two_hands_do_not_take_one_place():
 def test_a_jump_to_the_other_hand_is_the_product_over_cells():
     predicted, present = beliefs(5).square(), torch.tensor([[0.9, 0.6], [1.0, 0.3]])
     predicted = predicted / predicted.sum((2, 3), keepdim=True)
-    found = without_jumps(predicted, 5.0, 1.4, present)
+    found = without_jumps(predicted, 5.0, 1.4, 0.9, present)
     for n in range(2):
-        own = [
-            brute_blur(p, 1.4) * 1.2 * 2 * math.pi * 1.4**2 for p in predicted[n].double().numpy()
-        ]
-        near, seen = [np.clip(p, 0, 1) for p in own], present[n].tolist()
+        seen = present[n].tolist()
+        near, taken = (
+            [
+                np.clip(brute_blur(p, size) * 1.2 * 2 * math.pi * size**2, 0, 1)
+                for p in predicted[n].double().numpy()
+            ]
+            for size in (1.4, 0.9)
+        )
         for k in range(2):
             jump = 1 - np.exp(-5.0 * seen[k] * (near[k].max() - near[k]))
-            expected = predicted[n, k].numpy() * (1 - seen[1 - k] * near[1 - k] * jump)
+            expected = predicted[n, k].numpy() * (1 - seen[1 - k] * taken[1 - k] * jump)
             np.testing.assert_allclose(found[n, k], expected, atol=2e-6)
 
 
@@ -133,7 +137,7 @@ def test_a_hand_jumps_to_the_other_one_only_if_its_place_was_unknown():
     there[3, 1, 10, 9] = 1.0  # it was here, nobody knows where the third right hand was
     there = there / there.sum((2, 3), keepdim=True)
     present = torch.tensor([[1.0, 1.0], [1.0, 0.0], [1.0, 1.0], [1.0, 1.0]])
-    kept = (without_jumps(there, 5.0, 3.0, present) / there)[:, 1, 10, 8]
+    kept = (without_jumps(there, 5.0, 3.0, 3.0, present) / there)[:, 1, 10, 8]
     assert kept[0] < 0.02
     assert (kept[1:] > 0.9).all()
 

@@ -106,24 +106,30 @@ def _whole_grid(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def without_jumps(
-    predicted: Float[Tensor, "N 2 h w"], cost: float, reach: float, present: Float[Tensor, "N 2"]
+    predicted: Float[Tensor, "N 2 h w"],
+    cost: float,
+    reach: float,
+    radius: float,
+    present: Float[Tensor, "N 2"],
 ) -> Float[Tensor, "N 2 h w"]:
     """Return the predictions of both hands, less likely where one could only have jumped to the other.
 
-        p'_k(x) = p_k(x) (1 - v_l near_l(x) (1 - exp(-J v_k (max_y near_k(y) - near_k(x)))))
+        p'_k(x) = p_k(x) (1 - v_l taken_l(x) (1 - exp(-J v_k (max_y near_k(y) - near_k(x)))))
 
-    near_k is the predicted probability of a hand within about `reach` of x. A hand that was seen elsewhere
+    near_k is the predicted probability of a hand within about `reach` of x, taken_l that of the other one
+    within about `radius`. A hand that was seen elsewhere
     has to move to the other hand l, however much the place of l looks like a hand. One whose place was
     not known, or that was not visible, may appear there.
 
     Args:
-        predicted: p, each sums to one. cost: J, nats. reach: cells.
+        predicted: p, each sums to one. cost: J, nats. reach, radius: cells.
         present: v, the probability that each hand is visible.
     """
     there = present[..., None, None]
-    near = _mass_near(predicted, reach, predicted.sum((2, 3), keepdim=True))
+    total = predicted.sum((2, 3), keepdim=True)
+    near, taken = (_mass_near(predicted, size, total) for size in (reach, radius))
     jump = near.amax((2, 3), keepdim=True).sub(near).mul_(-cost * there).expm1_()
-    return jump.mul_((near * there).flip(1)).add_(1).mul_(predicted)
+    return jump.mul_(taken.mul_(there).flip(1)).add_(1).mul_(predicted)
 
 
 def exclude(

@@ -206,8 +206,8 @@ class HandSettings:
         beside_network: weight of all other cues beside a network's.
         exclusion_beside_network, crossing_beside_network: take the places of `exclusion` and `crossing`
             beside a network, which knows hands that are joined and tells left from right itself.
-        jump_to_other, jump_reach: cost beside a network of a jump of one hand to the other, in nats, and how
-            far a hand moves in a frame.
+        jump_to_other, jump_reach, jump_radius: cost beside a network of a jump of one hand to the other, in
+            nats, how far a hand moves without it, and how far from the other one it counts.
         gone_bias: added to a network's log-odds that a hand is gone: those of strangers look less like hands.
         gone_weight: share of a frame's log-odds that a hand is gone that counts; frames are alike.
         gone_stay: probability that it is still gone, or still there, in the next frame.
@@ -265,7 +265,8 @@ class HandSettings:
     exclusion_beside_network: float = 0.8
     crossing_beside_network: float = 0.7
     jump_to_other: float = 5.0
-    jump_reach: float = 0.65
+    jump_reach: float = 1.2
+    jump_radius: float = 0.5
     gone_bias: float = -2.0
     gone_weight: float = 0.5
     gone_stay: float = 0.97

@@ -344,7 +344,9 @@ class HandTracker(nn.Module):
         exclusion, crossing, present = s.exclusion, s.crossing, 1 - state.gone
         if self.network is not None:
             exclusion, crossing = s.exclusion_beside_network, s.crossing_beside_network
-            predicted = without_jumps(predicted, s.jump_to_other, s.jump_reach / CELL, present)
+            predicted = without_jumps(
+                predicted, s.jump_to_other, s.jump_reach / CELL, s.jump_radius / CELL, present
+            )
         return exclude(
             predicted * weight, exclusion, s.exclusion_radius / CELL,
             crossing, s.crossing_soft / CELL, present,
