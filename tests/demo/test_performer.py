@@ -192,3 +192,11 @@ def test_bad_input_is_named() -> None:
         demo.performer(0)
     with pytest.raises(InputError, match=r"BodySize\.forearm"):
         BodySize(forearm=-0.2)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "word"), [(8.7, "reach"), (9.4, "cross"), (11.5, "cross"), (11.8, "rest")]
+)
+def test_frames_have_the_word_of_the_nearest_key_frame(seconds: float, word: str) -> None:
+    performance = demo.performer(fps=30.0)
+    assert performance.labels[round(30 * seconds)] == word

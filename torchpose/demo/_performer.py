@@ -136,7 +136,7 @@ def performer_angles(
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[BodyAngles, tuple[str, ...]]:
-    """Return the joint angles of the performance, and the action in each frame.
+    """Return the joint angles of the performance, and in each frame the action of the nearest key frame.
 
     Movements between key frames have minimum jerk, and the torso starts a little before the arms. Slow
     sway, breathing and tremor are added. The performance repeats after 20 s.
@@ -173,8 +173,8 @@ def performer_angles(
         trunk[:, 1],
         torch.deg2rad(torch.maximum(torch.minimum(arms, high), low)).to(dtype),
     )
-    after = torch.searchsorted(keys, time.contiguous(), right=True).clamp(1, len(_KEYS) - 1)
-    return angles, tuple(_KEYS[i][1] for i in after.tolist())
+    nearest = (time[:, None] - keys).abs().argmin(1)
+    return angles, tuple(_KEYS[i][1] for i in nearest.tolist())
 
 
 def hip_sway(clock: Tensor, generator: torch.Generator) -> Float[Tensor, "T 3"]:
