@@ -62,7 +62,7 @@ def test_measurements_of_a_projected_sequence_are_the_window_states():
     uv = pixels(sequence())[None]
     mask = torch.ones(1, 12, 8, dtype=torch.bool)
     for side in ("left", "right"):
-        values, known = window_measurements(uv, mask, LAYOUT, side, still_path())
+        values, known = window_measurements(uv, mask, LAYOUT, [side], still_path())
         inner = slice(2, 11)
         torch.testing.assert_close(values[0, inner].flatten(1), states()[side][inner, 21:])
         assert known[0, inner].all()
@@ -71,7 +71,7 @@ def test_measurements_of_a_projected_sequence_are_the_window_states():
             uv,
             mask,
             LAYOUT,
-            side,
+            [side],
             BodyPath(*(LAYOUT.lags, *(x[:, 5:] for x in still_path()[1:]))),
             5,
         )
@@ -83,10 +83,10 @@ def test_a_walking_body_has_the_same_window_as_one_that_stands():
     uv = pixels(sequence())[None]
     mask = torch.ones(1, 12, 8, dtype=torch.bool)
     walk = torch.linspace(0, 90, 12, dtype=torch.float64)[None, :, None] * torch.tensor([1.0, 0])
-    still, _ = window_measurements(uv, mask, LAYOUT, "left", still_path())
+    still, _ = window_measurements(uv, mask, LAYOUT, ["left"], still_path())
     places = torch.stack([walk.roll(lag, 1) for lag in LAYOUT.lags], 2)
     path = still_path()._replace(neck=still_path().neck + places)
-    moving, known = window_measurements(uv + walk[:, :, None], mask, LAYOUT, "left", path)
+    moving, known = window_measurements(uv + walk[:, :, None], mask, LAYOUT, ["left"], path)
     expected = still + walk[:, :, None]
     torch.testing.assert_close(moving[known], expected[known])
 
@@ -95,9 +95,9 @@ def test_hidden_hands_are_missing_in_every_window_that_holds_them():
     uv = pixels(sequence())[None]
     mask = torch.ones(1, 12, 8, dtype=torch.bool)
     mask[0, 5, 0] = False
-    _, known = window_measurements(uv, mask, LAYOUT, "left", still_path())
+    _, known = window_measurements(uv, mask, LAYOUT, ["left"], still_path())
     assert not known[0, 7, 0] and not known[0, 4, 1] and known[0, 5, 2]
-    _, known = window_measurements(uv, mask, LAYOUT, "right", still_path())
+    _, known = window_measurements(uv, mask, LAYOUT, ["right"], still_path())
     assert not known[0, 5, 2]
 
 
@@ -115,7 +115,7 @@ def test_lags_of_one_frame_are_measured_once(fps, repeated):
     layout = WindowLayout((4, 10, 20), (0, 10)).at_rate(fps)
     assert layout.repeated == repeated
     uv, mask = pixels(sequence(24))[None], torch.ones(1, 24, 8, dtype=torch.bool)
-    _, known = window_measurements(uv, mask, layout, "left", still_path(layout, 24))
+    _, known = window_measurements(uv, mask, layout, ["left"], still_path(layout, 24))
     assert known[0, -1].tolist() == [i not in repeated for i in range(5)]
 
 

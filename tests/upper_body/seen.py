@@ -2,7 +2,7 @@
 
 import torch
 
-from torchpose.upper_body._articulated_frame import as_rays, facts_of, split, upright
+from torchpose.upper_body._articulated_frame import Optics, as_rays, facts_of, split, upright
 from torchpose.upper_body._measured_joints import MeasuredJoints
 
 
@@ -15,5 +15,6 @@ def see_torso(rays, known, std):
     eye = torch.eye(3, dtype=rays.dtype)
     cov = std**2 * eye[:2, :2].expand(8, 2, 2)
     measured = MeasuredJoints(rays[:, None, :, :2] / rays[:, None, :, 2:], known[:, None], cov)
-    (frame,), (facts,) = split(as_rays(measured, eye, eye)), facts_of(measured, eye)
+    rays_of = as_rays(measured, Optics.of(eye))
+    (frame,), (facts,) = split(rays_of), facts_of(rays_of, measured, eye)
     return upright(frame, facts, eye.expand(len(rays), 3, 3)).torso

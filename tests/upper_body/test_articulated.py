@@ -16,6 +16,7 @@ from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
+from torchpose.upper_body._articulated_frame import LIMBS, SHOULDERS
 from torchpose.upper_body._articulated_poses import _trust
 from torchpose.upper_body._estimator import TrackerModel
 from torchpose.upper_body._root_grid import RootGrid
@@ -368,7 +369,8 @@ def test_covariances_are_calibrated_by_what_is_measured_of_an_arm():
     def trust(*missing):
         known = everything.clone()
         known[:, [ROW[name] for name in missing]] = False
-        return _trust(known, exact)
+        limbs = known[:, list(LIMBS)].unflatten(1, (2, 2))
+        return _trust(known[:, SHOULDERS], limbs, exact)
 
     whole, alone = float(trust()[0, 0]), float(trust("elbow_left")[0, 0])
     assert 0.4 < whole < alone < 1.0

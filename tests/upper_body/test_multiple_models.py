@@ -14,7 +14,7 @@ from torchpose.math import euler_to_matrix
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body._fusion import ReadOut, in_camera_axes
+from torchpose.upper_body._fusion import ReadOut, in_body_axes, in_camera_axes, put_at
 from torchpose.upper_body._multiple_models import _averaged
 
 BOTH = ("window-mixture", "articulated")
@@ -163,29 +163,39 @@ def test_frames_without_arms_leave_the_odds(prior):
     torch.testing.assert_close(share[10:], share[9].expand(20), atol=1e-8, rtol=1e-6)
 
 
-def reading(seed):
+def poses(seed, angles=None):
+    """Poses in camera axes of one frame."""
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     covs, uv_covs = (x @ x.mT for x in (draw(1, 1, 8, 3, 3), draw(1, 1, 8, 2, 2)))
-    angles, place = 0.3 * draw(1, 1, 3), draw(1, 1, 3)
-    return ReadOut(draw(1, 1, 8, 3), covs, angles, place, draw(1, 1, 8, 2), uv_covs)
+    angles = 0.3 * draw(1, 1, 3) if angles is None else torch.tensor([[angles]]).double()
+    reading = ReadOut(draw(1, 1, 8, 3), covs, angles, draw(1, 1, 3), draw(1, 1, 8, 2), uv_covs)
+    return reading, in_camera_axes(reading, "zxy")
 
 
 @pytest.mark.parametrize(("share", "which"), [(1.0, 0), (0.0, 1)])
 def test_all_the_weight_is_one_of_the_two(share, which):
-    two = reading(0), reading(1)
-    mixed = _averaged(torch.tensor([[share]], dtype=torch.float64), *two, "zxy")
-    for found, wanted in zip(mixed, two[which], strict=True):
-        torch.testing.assert_close(found, wanted)
+    two = poses(0)[1], poses(1)[1]
+    mixed = _averaged(torch.tensor([[share]], dtype=torch.float64), *two)
+    for name in ("joints", "covs", "place", "uv", "uv_covs", "rotation"):
+        torch.testing.assert_close(getattr(mixed, name), getattr(two[which], name))
+
+
+def test_poses_go_to_the_camera_and_back():
+    reading, seen = poses(0)
+    back = in_body_axes(seen)
+    torch.testing.assert_close(back.joints, reading.joints)
+    torch.testing.assert_close(back.covs, reading.covs)
+    elsewhere = put_at(seen, torch.tensor([0.1, 0.2, 3.0]))
+    torch.testing.assert_close(in_body_axes(elsewhere).joints, reading.joints)
 
 
 def test_covariances_are_those_of_a_mixture():
-    two, share = (reading(0), reading(1)), 0.3
-    mixed = _averaged(torch.tensor([[share]], dtype=torch.float64), *two, "zxy")
-    seen = [in_camera_axes(x, "zxy") for x in (*two, mixed)]
+    two, share = (poses(0)[1], poses(1)[1]), 0.3
+    seen = [*two, _averaged(torch.tensor([[share]], dtype=torch.float64), *two)]
     generator = torch.Generator().manual_seed(2)
     n = 400_000
     first = torch.rand(n, generator=generator) < share
@@ -201,12 +211,10 @@ def test_covariances_are_those_of_a_mixture():
 
 
 def test_the_mean_rotation_is_half_way():
-    zero, turned = (
-        reading(0)._replace(angles=torch.tensor([[[0.0, 0.0, x]]]).double()) for x in (0.0, 0.8)
-    )
-    mixed = _averaged(torch.tensor([[0.5]], dtype=torch.float64), zero, turned, "zxy")
+    two = (poses(0, [0.0, 0.0, x])[1] for x in (0.0, 0.8))
+    mixed = _averaged(torch.tensor([[0.5]], dtype=torch.float64), *two)
     wanted = euler_to_matrix(torch.tensor([0.0, 0.0, 0.4], dtype=torch.float64), "zxy")
-    torch.testing.assert_close(euler_to_matrix(mixed.angles[0, 0], "zxy"), wanted)
+    torch.testing.assert_close(mixed.rotation[0, 0], wanted)
 
 
 def test_covariances_of_windows_are_recalibrated_before(prior):

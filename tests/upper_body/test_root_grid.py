@@ -18,7 +18,7 @@ def grid():
 
 def lengths(width=0.34, height=0.19):
     sizes = (width, height, 0.04, 0.02)
-    return TorsoLengths(*(torch.tensor([size], dtype=torch.float64) for size in sizes))
+    return TorsoLengths.of(*(torch.tensor([size], dtype=torch.float64) for size in sizes))
 
 
 def seen(depth, size=1.0, turn=0.0):

@@ -172,6 +172,13 @@ def outside_inference() -> Iterator[None]:
         yield
 
 
+@functools.cache
+def index_tensor(rows: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return rows as a tensor to index with, the same one each time."""
+    with outside_inference():
+        return torch.tensor(rows, dtype=torch.long, device=device)
+
+
 def _kept_in(kept: _Kept, key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]) -> T:
     entry = kept.get(key)
     same = entry is not None and len(entry.marks) == len(given)

@@ -71,9 +71,11 @@ def backproject(
     check_shape("uvl", uvl, ["...", None, 3])
     check_shape("K", K, ["...", 3, 3])
     # K is triangular, so its inverse needs no solver (there is none for half precision).
-    depth = uvl[..., 2:]
-    level = (uvl[..., :2] - K[..., None, :2, 2]) @ _inverse_slope(K).mT
-    return torch.cat([level * depth, depth], -1)
+    fx, skew, _, fy = K[..., None, :2, :2].flatten(-2).unbind(-1)
+    pixels, depth = uvl.split([2, 1], -1)
+    u, v = (pixels - K[..., None, :2, 2]).unbind(-1)
+    y = v / fy
+    return torch.stack([(u - skew * y) / fx, y, torch.ones_like(y)], -1) * depth
 
 
 def lift(
@@ -247,9 +249,7 @@ def arm_in_camera_frame(
     Returns:
         Mean [..., 5, 3] in metres and covariance [..., 5, 3, 3] of hand, elbow, shoulder, head, neck.
     """
-    joints = mean[..., :15].unflatten(-1, (5, 3))
-    blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
-    own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+    joints, own = mean[..., :15].unflatten(-1, (5, 3)), joint_blocks(cov[..., :15, :15])
     return _unscented(lambda points: backproject(points, matrix), joints, own)
 
 
@@ -279,10 +279,11 @@ def arm_in_body_frame(
 
     flat_mean, flat_cov = mean.reshape(-1, 21), cov.reshape(-1, 21, 21)
     parts = [
-        _joint_blocks(*_unscented(to_body, m, c))
+        _unscented(to_body, m, c)
         for m, c in zip(flat_mean.split(_CHUNK), flat_cov.split(_CHUNK), strict=True)
     ]
-    joints, covs = (torch.cat(values) for values in zip(*parts, strict=True))
+    joints = torch.cat([joints for joints, _ in parts])
+    covs = torch.cat([joint_blocks(cov) for _, cov in parts])
     return joints.view(*mean.shape[:-1], 5, 3), covs.view(*mean.shape[:-1], 5, 3, 3)
 
 
@@ -292,9 +293,10 @@ def _unscented(
     return unscented_transform(function, mean, cov, centre=True, directions="cholesky")
 
 
-def _joint_blocks(mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
+def joint_blocks(cov: Float[Tensor, "*batch 15 15"]) -> Float[Tensor, "*batch 5 3 3"]:
+    """Return the covariances of five joints, of the covariance of them all."""
     blocks = cov.unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
-    return mean.unflatten(-1, (5, 3)), blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
 
 
 def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *rest"]) -> Tensor:
@@ -307,7 +309,6 @@ def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *r
     return torch.cat([left[:, :, :3], shared, right[:, :, :3].flip(2)], 2)
 
 
-def pixel_covariances(cov: Float[Tensor, "B T 21 21"]) -> Float[Tensor, "B T 5 2 2"]:
+def pixel_covariances(cov: Float[Tensor, "*batch 21 21"]) -> Float[Tensor, "*batch 5 2 2"]:
     """Return the covariances of (u, v) of the five joints of an arm, pixels squared."""
-    blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
-    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)[..., :2, :2]
+    return joint_blocks(cov[..., :15, :15])[..., :2, :2]

@@ -10,18 +10,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.module_state import index_tensor, outside_inference
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 MEMORY = 1.0
 """Seconds of the past that tell where head and neck are."""
 
-_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+ANCHORS = slice(UPPER_BODY.index("head"), UPPER_BODY.index("neck") + 1)
+"""Rows of head and neck among the eight joints."""
+
 # Chosen on training persons who stand and who walk in a circle, see the benchmarks page.
 _NECK_ACCELERATION, _NECK_SPEED = 0.5, 1.0  # m/s after one second, and m/s at its start
 _HEIGHT_ACCELERATION, _HEIGHT_SPEED = 0.002, 0.01
@@ -34,6 +38,7 @@ _FARTHER, _NEARER = (0.15, 0.25), (0.3, 0.5)
 _REACH = 0.8  # metres from the neck to a hand, at most
 _BESIDE = 0.05  # radians beside the usual place, up to which the camera is not turned
 _LARGEST_ZOOM = 6.0
+_LEAST_DEPTH = 1e-3  # behind a camera is only what was far beside the image: it is kept finite
 _FRAMES_AT_A_TIME, _NUMBERS_AT_A_TIME = 4096, 1 << 24
 
 
@@ -71,10 +76,11 @@ class BodyPath(NamedTuple):
         They move along with the neck, and away from it as the body comes nearer:
             u' = n_t + (u - n_{t-lag}) |h_t| / |h_{t-lag}|
         """
-        now, then = self.lags.index(0), [self.lags.index(lag) for lag in lags]
-        size = self.height.norm(dim=-1, keepdim=True)
-        ratio = size[:, :, now : now + 1] / size[:, :, then].clamp_min(1e-6)
-        offset = (uv - self.neck[:, :, then]) * ratio.clamp(0.5, 2.0)
+        now = self.lags.index(0)
+        then = index_tensor(tuple(self.lags.index(lag) for lag in lags), uv.device)
+        size = torch.linalg.vector_norm(self.height, dim=-1, keepdim=True)
+        ratio = size[:, :, now : now + 1] / size.index_select(2, then).clamp_min(1e-6)
+        offset = (uv - self.neck.index_select(2, then)) * ratio.clamp(0.5, 2.0)
         return self.neck[:, :, now : now + 1] + offset
 
 
@@ -121,10 +127,12 @@ def body_path(
     past = memory_frames(lags, fps)
     if regression is None:
         regression = path_regression(lags, ahead, fps, model, uv)
-    anchors = uv[:, :, [_HEAD, _NECK]] - torch.stack([model.neck + model.height, model.neck])
-    known = mask[:, :, [_HEAD, _NECK], None].to(uv)
+    usual = torch.stack([model.neck + model.height, model.neck])
+    known = mask[:, :, ANCHORS, None]
+    anchors = torch.where(known, uv[:, :, ANCHORS] - usual, 0.0)
+    known = known.to(uv)
     more = torch.zeros_like(known) if variance is None else (variance - model.variance)[..., None]
-    frames = torch.cat([torch.where(known > 0, anchors, 0.0), known, more * known], -1)
+    frames = torch.cat([anchors, known, more * known], -1)
     frames = torch.nn.functional.pad(frames, (0, 0, 0, 0, past - start, ahead))
     batch, n_frames, width = uv.shape[0], uv.shape[1] - start, past + ahead + 1
     most = _FRAMES_AT_A_TIME if variance is None else _FRAMES_AT_A_TIME // 8
@@ -268,37 +276,44 @@ def _excess(value: Tensor, low: float, high: float) -> Tensor:
 def _axes(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the axes with z along a ray and x level, as columns."""
     z = torch.nn.functional.normalize(ray, dim=-1)
-    down = torch.zeros_like(z)
-    down[..., 1] = 1.0
-    x = torch.nn.functional.normalize(torch.linalg.cross(down, z), dim=-1)
+    across = torch.linalg.cross(_down(z.dtype, z.device).expand_as(z), z)
+    x = torch.nn.functional.normalize(across, dim=-1)
     return torch.stack([x, torch.linalg.cross(z, x), z], -1)
+
+
+@cache
+def _down(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3"]:
+    with outside_inference():
+        return torch.tensor([0.0, 1.0, 0.0], dtype=dtype, device=device)
 
 
 def to_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
-) -> Float[Tensor, "B T J 2"]:
-    """Return the pixels of the camera as the virtual camera sees them."""
-    centre = view.centre[..., None, :]
-    return centre + (_turned(uv, view.rotation, matrix) - centre) * view.zoom[..., None, None]
+) -> tuple[Float[Tensor, "B T J 2"], Float[Tensor, "B T J"]]:
+    """Return the pixels of the camera as the virtual camera sees them, and the log of a pixel's area there.
+
+    That of a turn about the camera's centre is the inverse cube of the homogeneous coordinate that it
+    divides by.
+    """
+    centre, zoom = view.centre[..., None, :], view.zoom[..., None]
+    seen = _homogeneous(uv) @ _homography(view.rotation, matrix).mT
+    level, depth = seen.split([2, 1], -1)
+    depth = depth.clamp_min(_LEAST_DEPTH)
+    area = 2 * zoom.log() - 3 * depth[..., 0].log()
+    return centre + (level / depth - centre) * zoom[..., None], area
 
 
 def from_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
-) -> Float[Tensor, "B T J 2"]:
-    """Return the pixels of the virtual camera as the camera sees them."""
-    return _turned(_shrunk(uv, view), view.rotation.mT, matrix)
-
-
-def view_jacobian(
-    uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
-) -> Float[Tensor, "B T J 2 2"]:
-    """Return the derivative of `from_view` at these pixels."""
+) -> tuple[Float[Tensor, "B T J 2"], Float[Tensor, "B T J 2 2"]]:
+    """Return the pixels of the virtual camera as the camera sees them, and the derivative of this map."""
     homography = _homography(view.rotation.mT, matrix)
-    top = _homogeneous(_shrunk(uv, view)) @ homography.mT
-    value, depth = top[..., :2, None] / top[..., 2:, None], top[..., 2:, None]
-    homography = homography[..., None, :, :]
-    slopes = homography[..., :2, :2] - value * homography[..., 2:, :2]
-    return slopes / (depth * view.zoom[..., None, None, None])
+    seen = _homogeneous(_shrunk(uv, view)) @ homography.mT
+    level, depth = seen.split([2, 1], -1)
+    top, bottom = homography[:, :, None, :, :2].split([2, 1], -2)
+    slopes = top - (level / depth)[..., None] * bottom
+    pixels = level / depth.clamp_min(_LEAST_DEPTH)
+    return pixels, slopes / (depth * view.zoom[..., None, None])[..., None]
 
 
 def planes_in_view(
@@ -316,29 +331,10 @@ def planes_in_view(
     return torch.cat([slope, (turned[..., 2] + shift - zoomed)[..., None]], -1)
 
 
-def log_magnification(
-    uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
-) -> Float[Tensor, "B T J"]:
-    """Return the log of the area that a pixel of the camera has in the virtual one, at these pixels.
-
-    It is -log |det J| of `view_jacobian`, where the determinant of a turn about the camera's centre is the
-    inverse cube of the homogeneous coordinate that it divides by.
-    """
-    homography = _homography(view.rotation.mT, matrix)
-    depth = (_homogeneous(_shrunk(uv, view)) @ homography[..., 2:, :].mT)[..., 0]
-    return 3 * depth.abs().log() + 2 * view.zoom.log()[..., None]
-
-
 def _shrunk(uv: Tensor, view: BodyView) -> Tensor:
     """Return pixels of the virtual camera without its zoom."""
     centre = view.centre[..., None, :]
     return centre + (uv - centre) / view.zoom[..., None, None]
-
-
-def _turned(uv: Tensor, rotation: Tensor, matrix: Tensor) -> Tensor:
-    seen = _homogeneous(uv) @ _homography(rotation, matrix).mT
-    # Behind the virtual camera is only what was far beside the image: keep it finite.
-    return seen[..., :2] / seen[..., 2:].clamp_min(1e-3)
 
 
 def _homography(rotation: Tensor, matrix: Tensor) -> Tensor:

@@ -98,8 +98,11 @@ class ConstantVelocityFilter(nn.Module):
         self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
         """Filter some more frames: the same numbers as `step` for one after the other."""
-        state, means, _ = self._run(state, z)
-        return state, means[:, :, 0]
+        found = []
+        for frame in z.unbind(1):
+            state, _ = self._advance(state, frame)
+            found.append(state.mean[:, 0])
+        return state, torch.stack(found, 1)
 
     def _advance(
         self, state: ConstantVelocityState, z: Tensor
@@ -108,7 +111,7 @@ class ConstantVelocityFilter(nn.Module):
         known = self._gains()
         predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
         gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
-        correction = gain[:, None] * (z - predicted[:, 0])[:, None]
+        correction = gain * (z[:, None] - predicted[:, :1])
         return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
     def forward(
@@ -201,7 +204,7 @@ def _held(numbers: Float[Tensor, "B T N"], lengths: Int[Tensor, " B"]) -> Float[
 
 
 def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Return Kalman gains [S, 2] and smoother gains [S, 2, 2], until they settle; r = 1."""
+    """Return Kalman gains [S, 2, 1] and smoother gains [S, 2, 2], until they settle; r = 1."""
     observed, unit = torch.tensor([0]), torch.ones(1, 1, dtype=matrix.dtype)
     predicted = torch.diag(torch.tensor([1.0, _VELOCITY_VARIANCE], dtype=matrix.dtype))
     gains, smoothers = [], []
@@ -214,4 +217,4 @@ def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         predicted = following
         if settled:
             break
-    return torch.stack(gains), torch.stack(smoothers)
+    return torch.stack(gains)[..., None], torch.stack(smoothers)

@@ -13,7 +13,7 @@ weighted sum of them is sum_j w_j Sigma_j less one product of the W_j, and a med
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -22,7 +22,7 @@ from torchpose._core.value_checks import values_visible
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._recompute import wants_gradient
 from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
-from torchpose.math._geometric_median import geometric_median, median_columns
+from torchpose.math._geometric_median import with_medians
 
 
 class FrameNoise(NamedTuple):
@@ -141,28 +141,26 @@ def own_moments(
     parts: MeasuredParts,
     frames: OwnFrames,
     log_weights: Float[Tensor, "N K"],
-    medians: Tensor,
+    medians: Int[Tensor, "P 3"],
     return_cov: bool,
 ) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
-    """Return the estimates of the mixture (BL 48) and, on request, their covariances.
+    """Return the estimates of the mixture (BL 48) and, on request, their second moments about these.
 
     Args:
         parts: from `measured_parts`. frames: from `condition_own`. log_weights: normalised.
-        medians: first of three dimensions each, points that are estimated by their geometric median.
+        medians: the dimensions of points that are estimated by their geometric median.
     """
     weights = log_weights.exp()
     rows, centres = parts.rows.to(model.dtype), parts.means.to(model.dtype)
     solved = torch.linalg.solve_triangular(frames.factor.mT, frames.white[..., None], upper=True)
-    gained = (weights[..., None] * solved[..., 0]).flatten(1)
+    solved = solved[..., 0]
+    gained = (weights[..., None] * solved).flatten(1)
     mean = weights @ centres + gained @ rows.flatten(0, 1)
-    total = None
-    if return_cov:
-        total = _covariance(parts, rows, frames, weights, solved[..., 0], mean)
-    if not len(medians):
-        return mean, total
-    columns = median_columns(medians)
-    off = _median_offset(parts, rows, frames, weights, solved[..., 0], mean, columns)
-    return mean - off, None if total is None else total + off[:, :, None] * off[:, None]
+    if len(medians):
+        mean = _medians(parts, rows, frames, weights, solved, mean, medians)
+    if not return_cov:
+        return mean, None
+    return mean, _covariance(parts, rows, frames, weights, solved, mean)
 
 
 def measured_parts(
@@ -229,22 +227,22 @@ def _explained(
     return explained[:, :dim, :dim]
 
 
-def _median_offset(
+def _medians(
     parts: MeasuredParts,
     rows: Tensor,
     frames: OwnFrames,
     weights: Tensor,
     solved: Tensor,
     mean: Tensor,
-    columns: Tensor,
+    medians: Int[Tensor, "P 3"],
 ) -> Float[Tensor, "N D"]:
-    """Return what the means exceed the geometric medians by, 0 in all but these columns."""
+    """Return the means with geometric medians in these dimensions."""
+    columns = medians.flatten()
     rows = rows[..., columns]
     means = parts.means[:, columns].to(rows) + _moved(solved, rows)
     seen = rows * frames.mask[:, None, :, None]
     white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)
     prior = parts.covs.diagonal(dim1=-2, dim2=-1)[:, columns].to(rows)
-    spread = (prior - white.square().sum(-2)).unflatten(-1, (-1, 3)).sum(-1)
-    points, start = (x.unflatten(-1, (-1, 3)) for x in (means, mean[:, columns]))
-    found = geometric_median(weights, points, spread, start).flatten(-2)
-    return torch.zeros_like(mean).index_copy(-1, columns, mean[:, columns] - found)
+    variances = prior - white.square().sum(-2)
+    means, variances = (x.unflatten(-1, medians.shape) for x in (means, variances))
+    return with_medians(mean, weights, means, variances, medians)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -28,9 +28,9 @@ from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
 from torchpose.filters._recompute import recomputed, wants_gradient
-from torchpose.filters._weights import WeightRule, estimate_of, frame_weights, normalise
+from torchpose.filters._weights import WeightRule, frame_weights, normalise, within_and_between
 from torchpose.math._gaussian import Gain, kalman_gain
-from torchpose.math._geometric_median import median_estimate
+from torchpose.math._geometric_median import median_columns, with_medians
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
@@ -103,13 +103,14 @@ def run_memoryless(
             the points that are estimated by their geometric medians. frames: all that is measured.
         return_cov: whether to return covariances. progress: whether to show a progress bar.
     """
-    return run_with_context(model, rule, medians, frames, return_cov, _ALL, progress)[0]
+    columns = median_columns(medians)
+    return run_with_context(model, rule, columns, frames, return_cov, _ALL, progress)[0]
 
 
 def run_with_context(
     model: MixtureKalmanFilter,
     rule: WeightRule,
-    medians: Tensor,
+    medians: Int[Tensor, "P 3"],
     frames: Measurements,
     return_cov: bool,
     wanted: Wanted,
@@ -121,7 +122,8 @@ def run_with_context(
     over their standard deviations, so that it takes no filter of its own.
 
     Args:
-        model, rule, frames, return_cov, progress: as `run_memoryless`. medians: among the wanted dimensions.
+        model, rule, frames, return_cov, progress: as `run_memoryless`.
+        medians: the three dimensions of each point that is estimated by its median, among the wanted ones.
         wanted: the dimensions and the context.
     """
     batch, n_frames, _ = frames.z.shape
@@ -176,17 +178,29 @@ def _estimate(
     if gain is None:
         mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
     else:
-        mean, total = estimate_of(log_weights, tracks.means, gain.covs if return_cov else None)
-        if len(medians):
-            mean, total = median_estimate(
-                log_weights, tracks.means, gain.covs, mean, total, medians
-            )
+        mean, total = _moments(log_weights, tracks.means, gain.covs, medians, return_cov)
     context = None
     if given.log_context is not None:
         there = group.mask[..., :n_context].any(-1)
         both = torch.logsumexp(normalise(rule.log_prior) + given.log_context, -1)
         context = torch.where(there, both, 0.0)
     return mean, log_weights, evidence, total, *mending(mean, given.jitter), context
+
+
+def _moments(
+    log_weights: Float[Tensor, "N M"],
+    means: Float[Tensor, "N M D"],
+    covs: Float[Tensor, "M D D"],
+    medians: Int[Tensor, "P 3"],
+    return_cov: bool,
+) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
+    """Return the estimates of mixtures (BL 48) and, on request, their second moments about these."""
+    weights = log_weights.exp()
+    mean = (weights[:, None] @ means)[:, 0]
+    if len(medians):
+        variances = covs.diagonal(dim1=-2, dim2=-1)[..., medians]
+        mean = with_medians(mean, weights, means[..., medians], variances, medians)
+    return mean, within_and_between(weights, means, mean, covs) if return_cov else None
 
 
 def _weighed(
@@ -211,7 +225,8 @@ def step_memoryless(
     if not values_visible():
         (group,) = _groups(model, frames, len(frame.z))
         shared = measured_parts(model)
-        found = _estimate(model, rule, medians, group, None, shared, return_cov)
+        columns = median_columns(medians)
+        found = _estimate(model, rule, columns, group, None, shared, return_cov)
         return later, StepOutput(*found[:-1])
     out = run_memoryless(model, rule, medians, frames, return_cov)
     values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
@@ -253,9 +268,10 @@ def _groups(
         yield from _groups_of_own(z, mask, noise)
         return
     for same in alike:
-        own_noise = frames.cov if noise is None else noise[same[0]]
+        first = 0 if len(alike) == 1 else int(same[0])
+        own_noise = frames.cov if noise is None else noise[first]
         for rows in same.split(at_a_time):
-            yield _Group(rows, z[rows], mask[same[0]], own_noise)
+            yield _Group(rows, z[rows], mask[first], own_noise)
 
 
 def _alike(mask: Bool[Tensor, "N Z"], noise: Float[Tensor, "N Z Z"] | None) -> Sequence[Tensor]:
@@ -292,7 +308,7 @@ def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, 
     shared = measured_parts(model)
     if group.shares_gain:
         gain = _gain(model, group, _ALL).gain
-        return _log_density(gain.log_norm, _whitened(shared, group, gain))
+        return _log_density(gain.log_norm, _whitened(shared, group, gain).square())
     return condition_own(model, shared, group.z, group.mask, group.noise).log_likelihood
 
 
@@ -320,10 +336,11 @@ def _condition(
     """Return every component given each frame."""
     gain = made.gain
     white = _whitened(shared, group, gain)
+    squares = white.square()
     means = torch.baddbmm(shared.means.to(model.dtype)[:, None], white.mT, gain.white)
     jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
-    context = _log_density(made.context_norm, white[:, :n_context]) if n_context else None
-    likelihood = _log_density(gain.log_norm, white)
+    context = _log_density(made.context_norm, squares[:, :n_context]) if n_context else None
+    likelihood = _log_density(gain.log_norm, squares)
     return _Conditioned(means.transpose(0, 1), likelihood, jitter, context)
 
 
@@ -334,9 +351,10 @@ def _whitened(shared: MeasuredParts, group: _Group, gain: Gain) -> Float[Tensor,
 
 
 def _log_density(
-    log_norm: Float[Tensor, " M"], white: Float[Tensor, "M Z N"]
+    log_norm: Float[Tensor, " M"], squares: Float[Tensor, "M Z N"]
 ) -> Float[Tensor, "N M"]:
-    return (log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+    """Return the log-density of innovations, of which the squares of whitened ones are given."""
+    return log_norm[:, None].sub(squares.sum(1), alpha=0.5).mT
 
 
 class _SharedGain(NamedTuple):

@@ -142,12 +142,12 @@ def finish_output(
         log_evidence = torch.where(inside, log_evidence, torch.zeros_like(log_evidence))
         work = Mending(*(part * inside for part in work))
     failed_at = first_not_finite(mean)
-    if not values_visible() or bool((failed_at >= 0).any()):
-        lost = frames >= failed_at[:, None]
-        lost = lost & (failed_at >= 0)[:, None]
+    failed = failed_at >= 0
+    if not values_visible() or bool(failed.any()):
+        lost = (frames >= failed_at[:, None]) & failed[:, None]
         log_weights = log_weights.masked_fill(lost[..., None], float("nan"))
-    if values_visible():
-        _warn_of_failures(failed_at)
+        if values_visible():
+            _warn_of_failures(failed_at)
     return FilterOutput(mean, log_weights, log_evidence, cov, failed_at, *work)
 
 
@@ -155,13 +155,11 @@ def first_not_finite(values: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
     """Return the first frame in which any value is NaN or infinite, -1 where none is."""
     bad = ~torch.isfinite(values).all(-1)
     first = bad.int().argmax(1)
-    return torch.where(bad.any(1), first, torch.full_like(first, -1))
+    return torch.where(bad.any(1), first, -1)
 
 
 def _warn_of_failures(failed_at: Int[Tensor, " B"]) -> None:
     failed = torch.nonzero(failed_at >= 0).reshape(-1).tolist()
-    if not failed:
-        return
     listed = ", ".join(f"element {b} at frame {int(failed_at[b])}" for b in failed[:8])
     warnings.warn(
         f"{len(failed)} of {len(failed_at)} sequences degenerated ({listed}); "

@@ -11,7 +11,7 @@ from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import conditioned_groups
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._weights import estimate_of
-from torchpose.math._geometric_median import geometric_median, median_columns
+from torchpose.math._geometric_median import median_columns, with_medians
 from torchpose.math._half_planes import outside_moments
 
 
@@ -56,8 +56,9 @@ def with_outside_point(
     for group, means, covs, logs in conditioned_groups(model, model.weight_rule, chosen):
         own, at = group.rows, rows[group.rows]
         found = _conditioned(
-            means, covs, logs, point.columns, planes[own], log_inside[own], model.medians
-        )
+            means, covs, logs, point.columns, planes[own], log_inside[own],
+            median_columns(model.medians),
+        )  # fmt: skip
         mean[at], total[at], weights[at] = (
             value.to(like) for value, like in zip(found, (mean, total, weights), strict=False)
         )
@@ -76,7 +77,7 @@ def _conditioned(
     columns: Int[Tensor, " 2"],
     planes: Float[Tensor, "N P 3"],
     log_inside: Float[Tensor, " N"],
-    medians: Int[Tensor, " K"],
+    medians: Int[Tensor, "K 3"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return mean, covariance, log-weights and the log of the mean mass of a group of frames."""
     means, logs = means.double(), logs.double()
@@ -92,14 +93,11 @@ def _conditioned(
     narrowed = ((logs.exp()[..., None, None] * change) @ gain.mT).flatten(1, 2)
     total = total + gain.transpose(0, 1).flatten(1) @ narrowed
     if len(medians):
-        column = median_columns(medians)
-        own = gain[:, column]
-        spread = covs.diagonal(dim1=-2, dim2=-1)[:, column] + ((own @ change) * own).sum(-1)
-        start = mean[:, column].unflatten(-1, (-1, 3))
-        found = geometric_median(
-            logs.exp(), means[..., column].unflatten(-1, (-1, 3)),
-            spread.unflatten(-1, (-1, 3)).sum(-1), start,
-        )  # fmt: skip
-        off = torch.zeros_like(mean).index_copy(-1, column, mean[:, column] - found.flatten(-2))
-        mean, total = mean - off, total + off[:, :, None] * off[:, None]
+        own = gain[:, medians.flatten()]
+        grown = ((own @ change) * own).sum(-1).unflatten(-1, medians.shape)
+        variances = covs.diagonal(dim1=-2, dim2=-1)[:, medians] + grown
+        around = mean
+        mean = with_medians(mean, logs.exp(), means[..., medians], variances, medians)
+        off = around - mean
+        total = total + off[:, :, None] * off[:, None]
     return mean, total, logs, log_mass

@@ -420,11 +420,11 @@ class RecursiveFilter(WideModule, ABC):
         """
         like = torch.empty(0, dtype=self.dtype, device=self.observed.device)
         z, mask, lengths = check_values(z, mask, lengths, like, self.observed.numel())
-        cov = self._own_noise() if measurement_cov is None else check_noise(measurement_cov, z)
+        cov = self.own_noise() if measurement_cov is None else check_noise(measurement_cov, z)
         check_generators(generator, len(z))
         return Measurements(z, mask, cov, lengths)
 
-    def _own_noise(self) -> Float[Tensor, "Z Z"]:
+    def own_noise(self) -> Float[Tensor, "Z Z"]:
         """Return R of the filter, float64."""
         given, count = self.measurement_cov, self.observed.numel()
         sources = (given,)

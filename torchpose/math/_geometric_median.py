@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 _STEPS = 5
-_LEAST = 1e-18  # of a squared distance, where a mean has no spread and is hit
+_LEAST = 1e-18  # of a spread, where a mean that has none is hit
 
 
 def geometric_median(
@@ -27,46 +27,38 @@ def geometric_median(
         E. Weiszfeld, "Sur le point pour lequel la somme des distances de n points donnés est
         minimum" (1937).
     """
-    offsets = (means - start[:, None]).transpose(1, 2).contiguous()  # cancels less, and in order
-    constant = (offsets.square().sum(-1) + spread.mT).flatten(0, 1)[..., None]
-    shares = weights[:, None].expand(offsets.shape[:3]).flatten(0, 1)[..., None]
-    offsets = offsets.flatten(0, 1)  # products of batches of one dimension need no broadcasting
-    along, x = offsets.mT, offsets.new_zeros(len(offsets), 3, 1)
+    # sqrt(|x - m|^2 + tr C) is the distance in one dimension more
+    away = spread.mT.clamp_min(_LEAST).sqrt().expand(len(means), -1, -1)[..., None]
+    offsets = (means - start[:, None]).transpose(1, 2)  # cancels less
+    points, flat = (
+        torch.cat([offsets, last], -1).flatten(0, 1) for last in (away, torch.zeros_like(away))
+    )
+    shares = weights[:, None, None].expand(-1, offsets.shape[1], -1, -1).flatten(0, 1)
+    x = torch.zeros_like(flat[:, :1])
     for _ in range(_STEPS):
-        squared = torch.baddbmm(constant, offsets, x, alpha=-2) + torch.bmm(x.mT, x)
-        pull = shares * squared.clamp_min(_LEAST).rsqrt()
-        x = torch.bmm(along, pull) / pull.sum(1, keepdim=True)
-    return start + x.reshape(start.shape)
+        pull = shares / torch.cdist(x, points, compute_mode="donot_use_mm_for_euclid_dist")
+        x = torch.bmm(pull, flat) / pull.sum(-1, keepdim=True)
+    return start + x[..., :3].view(start.shape)
 
 
-def median_columns(points: Int[Tensor, " P"]) -> Int[Tensor, " 3*P"]:
+def median_columns(points: Int[Tensor, " P"]) -> Int[Tensor, "P 3"]:
     """Return the three dimensions of each point, given the first of them."""
-    return (points[:, None] + torch.arange(3, device=points.device)).flatten()
+    return points[:, None] + torch.arange(3, device=points.device)
 
 
-def median_estimate(
-    log_weights: Float[Tensor, "N M"],
-    means: Float[Tensor, "N M D"],
-    covs: Float[Tensor, "*batch M D D"],
+def with_medians(
     mean: Float[Tensor, "N D"],
-    total: Float[Tensor, "N D D"] | None,
-    points: Int[Tensor, " P"],
-) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
-    """Return an estimate whose points are geometric medians, and its second moment about them.
+    weights: Float[Tensor, "N M"],
+    means: Float[Tensor, "N M P 3"],
+    variances: Float[Tensor, "*batch M P 3"],
+    columns: Int[Tensor, "P 3"],
+) -> Float[Tensor, "N D"]:
+    """Return the mean of a mixture with geometric medians in place of the means of its points.
 
     Args:
-        log_weights, means, covs: of the mixture. mean, total: its mean and covariance.
-        points: first of the three dimensions of each point.
+        mean: of the mixture. weights: of its components. means, variances: of their points.
+        columns: the three dimensions of each point (`median_columns`).
     """
-    columns = median_columns(points)
-    spread = covs.diagonal(dim1=-2, dim2=-1)[..., columns].unflatten(-1, (-1, 3)).sum(-1)
-    found = geometric_median(
-        log_weights.exp(),
-        means[..., columns].unflatten(-1, (-1, 3)),
-        spread.to(means.dtype),
-        mean[:, columns].unflatten(-1, (-1, 3)),
-    ).flatten(-2)
-    off = torch.zeros_like(mean).index_copy(-1, columns, mean[:, columns] - found)
-    if total is not None:
-        total = total + off[:, :, None] * off[:, None]
-    return mean - off, total
+    spread = variances.sum(-1).to(means.dtype)
+    found = geometric_median(weights, means, spread, mean[:, columns])
+    return mean.index_copy(-1, columns.flatten(), found.flatten(-2))

@@ -106,21 +106,17 @@ def matrix_to_euler(
     """
     check_shape("rotation", rotation, ["...", 3, 3])
     _check_order(order)
-    R = rotation
+    a, b, c, d, e, f, g, h, i = rotation.flatten(-2).unbind(-1)  # row by row
+    cos_mid = torch.hypot(g if order == "zxy" else h, i)
+    locked = cos_mid < 8 * torch.finfo(rotation.dtype).eps
     if order == "zxy":
-        cos_mid = torch.hypot(R[..., 2, 0], R[..., 2, 2])
-        locked = cos_mid < 8 * torch.finfo(R.dtype).eps
-        pitch = torch.atan2(R[..., 2, 1], cos_mid)
-        roll = torch.where(locked, 0.0, torch.atan2(-R[..., 0, 1], R[..., 1, 1]))
-        free = torch.atan2(-R[..., 2, 0], R[..., 2, 2])
-        yaw = torch.where(locked, torch.atan2(R[..., 0, 2], R[..., 0, 0]), free)
+        pitch = torch.atan2(h, cos_mid)
+        roll = torch.where(locked, 0.0, torch.atan2(-b, e))
+        yaw = torch.where(locked, torch.atan2(c, a), torch.atan2(-g, i))
     else:
-        cos_mid = torch.hypot(R[..., 2, 1], R[..., 2, 2])
-        locked = cos_mid < 8 * torch.finfo(R.dtype).eps
-        yaw = torch.atan2(-R[..., 2, 0], cos_mid)
-        roll = torch.where(locked, 0.0, torch.atan2(R[..., 1, 0], R[..., 0, 0]))
-        free = torch.atan2(R[..., 2, 1], R[..., 2, 2])
-        pitch = torch.where(locked, torch.atan2(-R[..., 1, 2], R[..., 1, 1]), free)
+        yaw = torch.atan2(-g, cos_mid)
+        roll = torch.where(locked, 0.0, torch.atan2(d, a))
+        pitch = torch.where(locked, torch.atan2(-f, e), torch.atan2(h, i))
     return torch.stack([roll, pitch, yaw], -1)
 
 
@@ -370,22 +366,15 @@ def procrustes(
     tensor([1., 1., 1.])
     """
     source, target = as_pair(source, target, mask, ["...", None, 3], ("source", "target"))
-    use = torch.isfinite(source).all(-1) & torch.isfinite(target).all(-1)
+    use = (torch.isfinite(source) & torch.isfinite(target)).all(-1, keepdim=True)
     if mask is not None:
-        use = use & mask
-    weight = use[..., None].to(source.dtype)
+        use = use & mask[..., None]
+    weight = use.to(source.dtype)
     count = weight.sum(-2, keepdim=True)
-    s = torch.where(use[..., None], source, torch.zeros_like(source))
-    x = torch.where(use[..., None], target, torch.zeros_like(target))
-    s_mean = s.sum(-2, keepdim=True) / count.clamp_min(1)
-    x_mean = x.sum(-2, keepdim=True) / count.clamp_min(1)
-    u, _, vh = torch.linalg.svd(((x - x_mean) * weight).mT @ ((s - s_mean) * weight))
+    s, x = torch.where(use, source, 0.0), torch.where(use, target, 0.0)
+    s_mean, x_mean = (points.sum(-2, keepdim=True) / count.clamp_min(1) for points in (s, x))
+    u, _, vh = torch.linalg.svd(((x - x_mean) * weight).mT @ (s - s_mean))
     sign = torch.linalg.det(u @ vh)
     last = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    rotation = (u * last[..., None, :]) @ vh
-    translation = (x_mean - s_mean @ rotation.mT).squeeze(-2)
-    few = (count < 3).reshape(count.shape[:-2])
-    return RigidMotion(
-        rotation.masked_fill(few[..., None, None], math.nan),
-        translation.masked_fill(few[..., None], math.nan),
-    )
+    rotation = ((u * last[..., None, :]) @ vh).masked_fill(count < 3, math.nan)
+    return RigidMotion(rotation, (x_mean - s_mean @ rotation.mT).squeeze(-2))

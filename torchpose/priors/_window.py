@@ -7,14 +7,13 @@ other arm into the estimate, which a mixture over single poses cannot.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose._core.module_state import outside_inference
+from torchpose._core.module_state import index_tensor
 from torchpose.camera._projection import project
 from torchpose.camera._viewpoints import Viewpoints
 from torchpose.camera._virtual_camera import BodyPath
@@ -244,7 +243,7 @@ def window_measurements(
     uv: Float[Tensor, "B T 8 2"],
     mask: Bool[Tensor, "B T 8"],
     layout: WindowLayout,
-    side: str,
+    sides: Sequence[str],
     path: BodyPath,
     start: int = 0,
 ) -> tuple[Float[Tensor, "B S H 2"], Bool[Tensor, "B S H"]]:
@@ -256,27 +255,22 @@ def window_measurements(
 
     Args:
         uv, mask: the eight joints in the prior's pixels. layout: lags in frames of this sequence.
-        side: "left" or "right". path: of the body, at the lags of the layout.
+        sides: whose windows, of "left" and "right". path: of the body, at the lags of the layout.
         start: first frame that is wanted, as in `body_path`.
 
     Returns:
-        Pixels [B, S, H, 2] and mask [B, S, H] of S = T - start frames and H = own + other hands, in
-        the order of the window state.
+        Pixels [B, S, H, 2] and mask [B, S, H] of S = T - start frames and the H own and other hands of each
+        side, in the order of the window state.
     """
-    own, other = _HANDS[side]
-    lags = (*layout.own, *layout.other)
-    joints = [own] * len(layout.own) + [other] * len(layout.other)
+    lags, joints = len(sides) * (*layout.own, *layout.other), []
+    for own, other in (_HANDS[side] for side in sides):
+        joints += [own] * len(layout.own) + [other] * len(layout.other)
     n_frames = uv.shape[1]
-    frames = torch.arange(start, n_frames, device=uv.device)[:, None] - _whole(lags, uv.device)
+    back = index_tensor(lags, uv.device)
+    frames = torch.arange(start, n_frames, device=uv.device)[:, None] - back
     inside = (frames >= 0) & (frames < n_frames)
-    frames = frames.clamp(0, n_frames - 1)
-    rows = _whole(tuple(joints), uv.device)
-    once = [i not in layout.repeated for i in range(layout.n_hands)]
-    known = mask[:, frames, rows] & inside & _whole(tuple(once), uv.device).bool()
-    return path.carried(uv[:, frames, rows], lags), known
-
-
-@cache
-def _whole(numbers: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:
-    with outside_inference():
-        return torch.tensor(numbers, dtype=torch.long, device=device)
+    once = [i % layout.n_hands not in layout.repeated for i in range(len(lags))]
+    if not all(once):
+        inside = inside & index_tensor(tuple(once), uv.device).bool()
+    frames, rows = frames.clamp(0, n_frames - 1), index_tensor(tuple(joints), uv.device)
+    return path.carried(uv[:, frames, rows], lags), mask[:, frames, rows] & inside

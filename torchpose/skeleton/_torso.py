@@ -20,6 +20,10 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 ALIGN_JOINTS = (3, 4, 2, 5)
 """Head, neck and both shoulders of the 8-joint upper body: what the paper aligns (BL section 6)."""
 
+_ALIGNED = slice(min(ALIGN_JOINTS), max(ALIGN_JOINTS) + 1)  # they lie side by side
+
+_ALIGNED = slice(min(ALIGN_JOINTS), max(ALIGN_JOINTS) + 1)  # they lie side by side
+
 TORSO = ((0.0, -0.20, 0.0), (0.0, -0.01, 0.0), (0.16, 0.10, 0.0), (-0.16, 0.10, 0.0))
 """Head, neck, left and right shoulder, metres: x to the person's left, y down, about their middle."""
 
@@ -59,8 +63,7 @@ def onto_torso(
     Args:
         pose, covs: in the axes of the torso. joints: of which only head, neck and shoulders count.
     """
-    chosen = list(ALIGN_JOINTS)
-    motion = procrustes(pose[..., chosen, :], joints[..., chosen, :])
+    motion = procrustes(pose[..., _ALIGNED, :], joints[..., _ALIGNED, :])
     moved = pose @ motion.rotation.mT + motion.translation[..., None, :]
     turn = motion.rotation[..., None, :, :]
     return moved, turn @ covs @ turn.mT

@@ -33,7 +33,7 @@ _LEAST = 1e-30  # density
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 # Directions, and arms of which all pairs of directions are compared, at a time: so that intermediate
 # results stay in the cache.
-_ROWS, _ARMS = 2048, 2
+_ROWS, _ARMS = 5120, 2
 
 
 class ArmInput(NamedTuple):
@@ -134,7 +134,7 @@ class DirectionDensity:
         self._first = torch.cat([first, alone])
         self._second = torch.cat([second, torch.full_like(alone, dim)])
         slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
-        self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
+        self.broad = slopes.new_tensor(math.log(prior.broad) - 2 * math.log(4 * math.pi))
         self._slopes_of_all = pad(slopes, (0, 1))
         self._slopes_of_all[-1, -1] = self.broad
         self._slopes_of_upper, self._slopes_of_lower = _by_bone(-0.5 * precision, pulled, constant)
@@ -151,13 +151,14 @@ class DirectionDensity:
             directions: those of upper arms and forearms. lowers: the number of consecutive forearms that
                 have their upper arm in common.
         """
-        rows = directions.reshape(-1, 6).double()
-        columns = pad(rows[::lowers, :3], (0, 1), value=1.0)
-        upper = (columns[:, :, None] * columns[:, None]).flatten(1) @ self._slopes_of_upper
-        count = max(1, _ROWS // lowers)
-        pairs = zip(upper.split(count), rows.split(count * lowers), strict=True)
-        known = torch.cat([self._known(*pair) for pair in pairs]).to(directions.dtype)
-        return torch.logaddexp(known, known.new_tensor(self.broad)).view(directions.shape[:-1])
+        rows = pad(directions.reshape(-1, 6).double(), (0, 1), value=1.0)
+        ends = pad(rows[::lowers, :3], (0, 1), value=1.0)
+        upper = (ends[:, :, None] * ends[:, None]).flatten(1) @ self._slopes_of_upper
+        count, columns = max(1, _ROWS // lowers), rows.mT.contiguous()
+        pairs = zip(upper.split(count), columns.split(count * lowers, 1), strict=True)
+        known = torch.cat([self._known(*pair) for pair in pairs])
+        found = torch.logaddexp(known, self.broad).to(directions.dtype)
+        return found.view(directions.shape[:-1])
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
@@ -173,22 +174,22 @@ class DirectionDensity:
         return columns.index_select(0, self._first) * columns.index_select(0, self._second)
 
     def _known(
-        self, upper: Float[Tensor, "U K"], rows: Float[Tensor, "N 6"]
-    ) -> Float[Tensor, " N"]:
+        self, upper: Float[Tensor, "U K"], columns: Float[Tensor, "7 N"]
+    ) -> Float[Tensor, "N 1"]:
         """Return the log-density of the mixture, without its broad part; exponentials are float32.
 
         Args:
-            upper: the polynomials' terms of the upper arms alone. rows: N / U directions for each of these.
+            upper: the polynomials' terms of the upper arms alone.
+            columns: N / U directions for each of these, and ones.
         """
-        columns = pad(rows, (0, 1), value=1.0).mT.contiguous()
         terms = (columns[3:6, None] * columns).flatten(0, 1)
-        logs = upper.repeat_interleave(len(rows) // len(upper), 0).addmm_(
+        logs = upper.repeat_interleave(columns.shape[1] // len(upper), 0).addmm_(
             terms.mT, self._slopes_of_lower
         )
         most = logs.detach().amax(-1, keepdim=True)
         # exp of what is far below is slow where it is denormal, and adds nothing
         near = logs.sub_(most).float().clamp_min_(_NOTHING).exp_()
-        return near.sum(-1).log() + most[:, 0]
+        return near.sum(-1, keepdim=True).log() + most
 
 
 class ArmChain:
@@ -333,8 +334,8 @@ class ArmChain:
 
     def _anew(self, seen: Bool[Tensor, "B 2"], like: Tensor) -> Float[Tensor, "B 2 1"]:
         """Return the share of each arm that is reinitialised in a frame."""
-        shares = like.new_tensor([self.anew_unseen, self.anew])
-        return shares[seen.long()][..., None]
+        shares = torch.full_like(like[..., :1], self.anew_unseen)
+        return shares.masked_fill(seen[..., None], self.anew)
 
     def smoothed(
         self, states: Sequence[ArmState], lengths: Tensor | None, lag: int | None
@@ -475,12 +476,12 @@ def _both_spheres(
 
 def mirrored(vectors: Float[Tensor, "B 2 *batch 3"]) -> Float[Tensor, "B 2 *batch 3"]:
     """Return vectors of both arms, with those of the right one mirrored."""
-    flip = _signs(vectors.dtype, vectors.device)
-    return vectors * flip.view(2, *[1] * (vectors.ndim - 3), 3)
+    return vectors * _signs(vectors.ndim - 3, vectors.dtype, vectors.device)
 
 
 @cache
-def _signs(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 3"]:
-    """Return the signs of the axes by which right arms are mirrored."""
+def _signs(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 *one 3"]:
+    """Return the signs of the axes by which right arms are mirrored, with so many axes between."""
     with outside_inference():
-        return torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]], dtype=dtype, device=device)
+        signs = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]], dtype=dtype, device=device)
+        return signs.view(2, *[1] * count, 3)

@@ -23,6 +23,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmChain, ArmState, DirectionDensity
 from torchpose.upper_body._articulated_frame import (
     Facts,
+    Optics,
     RayFrame,
     as_rays,
     facts_of,
@@ -61,11 +62,12 @@ class ArticulatedState(NamedTuple):
     Attributes:
         root: the belief over size, depth and turn of the torso at its last update, [B, S, Z, P].
         roots: the hypotheses about these of that update; None before the first frame.
-        lengths: the belief over the lengths of the bones.
-        arms: the belief over the arms; None before the first frame.
+        moments: the moments of the belief over these. lengths: the belief over the lengths of the bones.
+        sizes: the lengths themselves. arms: the belief over the arms; None before the first frame.
         middle: the middle of the shoulders, camera axes, [B, 3]; on the optical axis before any of the
             torso was seen.
-        lean: the moments of the line between the shoulders (`seen_lean`), [B, 2].
+        lean: the moments of the line between the shoulders (`seen_lean`), [B, 2]. tilt: the roll of the
+            axes in which it is level, [B, 3, 3].
         frame: the number of frames before.
         waiting: of whom no elbow or hand has been seen yet beside two joints of the torso, [B]; None if
             of nobody. One joint has no size in the image, and so no depth that arms could rule out.
@@ -73,10 +75,13 @@ class ArticulatedState(NamedTuple):
 
     root: Tensor
     roots: Roots | None
+    moments: Moments
     lengths: Lengths
+    sizes: Sizes
     arms: ArmState | None
     middle: Tensor
     lean: Tensor
+    tilt: Tensor
     frame: int
     waiting: Tensor | None
 
@@ -187,11 +192,11 @@ class ArticulatedFilter(Estimator):
             (like, self.prior.lengths, self.prior.spread),
             lambda: BodyLengths(self.prior, hand, neck, known, like),
         )
-        self.matrix, self.inverse = derived(
+        self.optics = derived(
             owner,
-            ("matrix and inverse", info.fx, info.fy, info.cx, info.cy),
+            ("optics", info.fx, info.fy, info.cx, info.cy),
             (like,),
-            lambda: (info.matrix.to(like), torch.linalg.inv(info.matrix.to(like))),
+            lambda: Optics.of(info.matrix.to(like)),
         )
         self.root = RootStep(self.grid, self.chain, self.lengths)
 
@@ -200,11 +205,25 @@ class ArticulatedFilter(Estimator):
     ) -> ArticulatedState:
         """Return the state before the first frame; see `Estimator`."""
         root = self.grid.init(batch_size, self.lengths.size_spread)
-        lengths = self.lengths.init(batch_size, self.grid.moments(root).of_size)
+        moments = self.grid.moments(root)
+        lengths = self.lengths.init(batch_size, moments.of_size)
+        sizes = self.lengths.sizes(lengths)
         middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
         lean = root.new_zeros(batch_size, 2)
         waiting = torch.ones(batch_size, dtype=torch.bool, device=root.device)
-        return ArticulatedState(root, None, lengths, None, middle, lean, 0, waiting)
+        return ArticulatedState(
+            root,
+            None,
+            moments,
+            lengths,
+            sizes,
+            None,
+            middle,
+            lean,
+            roll(lean_angle(lean)),
+            0,
+            waiting,
+        )
 
     def advance(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
@@ -248,35 +267,25 @@ class ArticulatedFilter(Estimator):
         """Yield the result of each frame."""
         if self.middle_alone:
             measured = with_middle(measured)
-        rays = split(as_rays(measured, self.matrix, self.inverse))
-        frames = zip(rays, facts_of(measured, self.matrix), strict=True)
-        before, sizes = self.grid.moments(state.root), self.lengths.sizes(state.lengths)
-        for frame, facts in tqdm([*frames], disable=not progress, desc="frames"):
-            step = self._step(state, frame, facts, before, sizes)
-            if step.state.lengths is not state.lengths:
-                sizes = self.lengths.sizes(step.state.lengths)
-            state, before = step.state, step.seen.after
+        rays = as_rays(measured, self.optics)
+        facts = facts_of(rays, measured, self.optics.matrix)
+        frames = zip(split(rays), facts, strict=True)
+        for frame, known in tqdm([*frames], disable=not progress, desc="frames"):
+            step = self._step(state, frame, known)
+            state = step.state
             yield step
 
-    def _step(
-        self, state: ArticulatedState, frame: RayFrame, facts: Facts, before: Moments, sizes: Sizes
-    ) -> _Step:
+    def _step(self, state: ArticulatedState, frame: RayFrame, facts: Facts) -> _Step:
         """Return the result of a frame, computed in tilted axes, in which the torso is upright.
 
         Args:
             state: the state before the frame. frame: its measurements. facts: what holds for them.
-            before, sizes: the moments of the torso and the lengths of the bones in that state.
         """
-        moments = state.lean
+        lean, tilt, sizes, moments = state.lean, state.tilt, state.sizes, state.moments
         if facts.leaning:
-            moments = seen_lean(
-                moments,
-                frame.rays[:, : len(UPPER_BODY)],
-                frame.known,
-                before.depth,
-                self.model.rate,
-            )
-        tilt = roll(lean_angle(moments))
+            joints = frame.rays[:, : len(UPPER_BODY)]
+            lean = seen_lean(lean, joints, frame.known, moments.depth, self.model.rate)
+            tilt = roll(lean_angle(lean))
         last = (state.middle[:, None] @ tilt)[:, 0]
         tilted = upright(frame, facts, tilt)
         # the torso: one hypothesis of the root, the mean of those near the likeliest
@@ -289,8 +298,9 @@ class ArticulatedFilter(Estimator):
                 fresh, waiting = _some(waiting & there), _some(waiting & ~there)
                 power = power if fresh is None else power.masked_fill(fresh, 1.0)
             belief, roots = self.root.weigh(belief, tilted, last, sizes, power, fresh)
+            moments = self.grid.moments(belief)
         root = roots.mean
-        middle = self.root.middle(tilted.torso, root, last, sizes)
+        middle = self.root.middle(tilted, root, last, sizes)
         shoulders = shoulder_places(tilted, root, middle, sizes.torso.width)
         # the arms, given the torso
         arms = self.root.arms(tilted, root, shoulders, sizes)
@@ -305,13 +315,24 @@ class ArticulatedFilter(Estimator):
         if state.frame % self.stride == 0:
             evidence = partial(self.root.evidence_of_lengths, tilted, root, shoulders)
             learnt = self.lengths.learn(learnt, tilted.torso, root, evidence)
+            sizes = self.lengths.sizes(learnt)
         seen = _Seen(
-            frame, facts, tilt, sizes, state.lengths, before, self.grid.moments(belief),
-            roots, root, middle, shoulders,
+            frame, facts, tilt, state.sizes, state.lengths, state.moments, moments, roots, root,
+            middle, shoulders,
         )  # fmt: skip
         middle = (middle @ tilt.mT)[:, 0]
         after = ArticulatedState(
-            belief, roots, learnt, posterior, middle, moments, state.frame + 1, waiting
+            belief,
+            roots,
+            moments,
+            learnt,
+            sizes,
+            posterior,
+            middle,
+            lean,
+            tilt,
+            state.frame + 1,
+            waiting,
         )
         return _Step(after, seen, posterior)
 
@@ -330,7 +351,9 @@ class ArticulatedFilter(Estimator):
                 turn,
                 self.neck_between,
             ),
-            known=seen.frame.known,
+            shoulders=seen.frame.torso[:, :2],
+            limbs=seen.frame.limbs,
+            whole=seen.facts.whole,
             exact=seen.frame.exact,
             lengths=seen.sizes.metres,
             bones=self.lengths.shown(seen.lengths, seen.before.size, seen.before.of_size),
@@ -340,10 +363,10 @@ class ArticulatedFilter(Estimator):
             turn=seen.root.turn[:, 0],
             tilt=seen.tilt,
         )
-        return pose_of(body, arms, self.matrix, self.model.calibrated)
+        return pose_of(body, arms, self.optics.log_focal, self.model.calibrated)
 
     def _estimates(self, poses: Sequence[FramePose], batch_size: int) -> Estimates:
-        return estimates_of(poses, batch_size, self.matrix, self.lengths.names)
+        return estimates_of(poses, batch_size, self.optics.matrix, self.lengths.names)
 
 
 def _some(chosen: Tensor) -> Tensor | None:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from torchpose._core.module_state import outside_inference
+from torchpose._core.module_state import index_tensor
 from torchpose.filters._outputs import FilterOutput, first_not_finite
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import ArmState, mirrored
-from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
-from torchpose.upper_body._estimator import Bones, Estimates, ReadOut
+from torchpose.upper_body._articulated_frame import HANDS, LIMBS, SHOULDERS
+from torchpose.upper_body._estimator import Bones, CameraPoses, Estimates
 
 _NECK = UPPER_BODY.index("neck")
 _STD = 0.03  # metres: of every joint in space
@@ -33,19 +31,21 @@ class SeenBody(NamedTuple):
 
     Attributes:
         joints: shoulders, neck and head, metres, [B, 8, 3]; the others are 0.
-        known: which of the eight joints are measured, [B, 8].
+        shoulders: whether these are measured, [B, 2]. limbs: whether elbow and hand of both arms are,
+            [B, 2, 2]. whole: whether both of any arm are.
         exact: whether every keypoint has full confidence, [B].
         lengths: the lengths of the bones, metres, [B, 4]. bones: the same as they are reported, with
             their covariances.
         scale: the standard deviation of the log of their common scale, [B].
-        others: the covariances of both elbows, then both hands, over the hypotheses of the root
-            (`covs_of_roots`), [B, 4, 3, 3].
+        others: the covariances of `LIMBS` over the hypotheses of the root (`covs_of_roots`), [B, 4, 3, 3].
         far: the variance of the log of the depth, [B].
         turn: the turn of the shoulders, radians, [B]. tilt: the roll of the tilted axes, [B, 3, 3].
     """
 
     joints: Tensor
-    known: Tensor
+    shoulders: Tensor
+    limbs: Tensor
+    whole: bool
     exact: Tensor
     lengths: Tensor
     bones: Bones
@@ -63,7 +63,7 @@ class FramePose(NamedTuple):
         joints: camera axes, metres, [B, 8, 3]. covs: [B, 8, 3, 3].
         means, mean_covs: the posterior means of the joints, of which bones may be shorter, and the
             covariances about these.
-        turn: of the shoulders, radians, [B]. tilt: of the torso about the optical axis, [B, 3, 3].
+        rotation: from the axes of the body to those of the camera, [B, 3, 3].
         log_evidence: the log-evidence of both arms, [B, 2].
         log_weights: the log-weights of their hypotheses, [B, 2, N].
         bones, bone_covs: the lengths of bones, [B, 4], and their covariances, [B, 4, 4].
@@ -73,8 +73,7 @@ class FramePose(NamedTuple):
     covs: Tensor
     means: Tensor
     mean_covs: Tensor
-    turn: Tensor
-    tilt: Tensor
+    rotation: Tensor
     log_evidence: Tensor
     log_weights: Tensor
     bones: Tensor
@@ -97,7 +96,7 @@ def bones_of(
 
 
 def pose_of(
-    body: SeenBody, belief: ArmState, matrix: Float[Tensor, "3 3"], calibrated: bool = True
+    body: SeenBody, belief: ArmState, log_focal: Float[Tensor, ""], calibrated: bool = True
 ) -> FramePose:
     """Return the estimate of a frame, in camera axes: the pose of least expected squared error.
 
@@ -105,41 +104,50 @@ def pose_of(
     it is the posterior mean, whose joints are nearer to the shoulder.
 
     Args:
-        body: the body but for its arms. belief: the posterior of the arms. matrix: K of the prior's camera.
-        calibrated: whether the covariances of measured arms are scaled as recordings of other persons
-            needed.
+        body: the body but for its arms. belief: the posterior of the arms.
+        log_focal: the log of the focal length, pixels. calibrated: whether the covariances of measured arms
+            are scaled as recordings of other persons needed.
     """
-    axes = upright_axes(body.turn)[:, None, None]
-    known = body.known[:, [ELBOWS, HANDS]]
-    mean = belief.weight[:, :, None] @ belief.directions
+    axes, rows = upright_axes(body.turn), index_tensor(LIMBS, body.turn.device)
     shoulders = body.joints[:, SHOULDERS]
-    means = bones_of(mean, axes, body.lengths).cumsum(-2)[:, :, 0]
-    both = known.all(1)[..., None, None]
-    arms = torch.where(both, _with_lengths(means, body.lengths), means)
-    ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
-    off = (ends - means[:, :, None]).transpose(2, 3)
-    spread = (belief.weight[:, :, None, :, None] * off).mT @ off
-    limbs = (shoulders[:, :, None] + arms).transpose(1, 2).flatten(1, 2)
-    moved = (means - arms).transpose(1, 2).flatten(1, 2)
-    joints = body.joints.index_copy(1, _limb_rows(limbs.device), limbs)
-    trust = torch.ones_like(joints[..., 0])
-    if calibrated:
-        of_limbs = _trust(body.known, body.exact).to(trust).repeat(1, 2)
-        trust = trust.index_copy(1, _limb_rows(limbs.device), of_limbs)
-    trust = trust[..., None, None]
-    mean_covs = trust * _covs(body, joints, spread.transpose(1, 2).flatten(1, 2))
-    apart = torch.zeros_like(joints).index_copy(1, _limb_rows(limbs.device), moved)
-    covs = mean_covs + trust * apart[..., :, None] * apart[..., None, :]
-    area = 2 * shoulders[..., 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
-    evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]
-    evidence = torch.where(known.any(1), evidence, 0.0)
-    tilt = body.tilt[:, None]
-    weight = belief.weight.clamp_min(1e-30).log()
+    ends = bones_of(belief.directions, axes[:, None, None], body.lengths).cumsum(-2)
+    weight = belief.weight[..., None]
+    means = (weight.mT @ ends.flatten(-2)).unflatten(-1, (2, 3))
+    off = (ends - means).transpose(2, 3)
+    spread = (weight[:, :, None] * off).mT @ off
+    means = means[:, :, 0]
+    arms = means
+    if body.whole:
+        both = body.limbs.all(-1)[..., None, None]
+        arms = torch.where(both, _with_lengths(means, body.lengths), means)
+    joints = body.joints.index_copy(1, rows, (shoulders[:, :, None] + arms).flatten(1, 2))
+    covs, of_limbs = _covs(body, joints, spread.flatten(1, 2))
+    trust = _trust(body.shoulders, body.limbs, body.exact).to(covs)
+    trust = trust.repeat_interleave(2, 1)[..., None, None]
+    mean_covs = covs.index_copy(1, rows, trust * of_limbs if calibrated else of_limbs)
+    posterior = joints, mean_covs
+    if body.whole:
+        moved = (means - arms).flatten(1, 2)
+        square = moved[..., :, None] * moved[..., None, :]
+        covs = mean_covs.index_add(1, rows, trust * square if calibrated else square)
+        posterior = joints.index_add(1, rows, moved), mean_covs
+    area = 2 * (shoulders[..., 2].mean(1).log() - log_focal)
+    evidence = belief.log_evidence + body.limbs.sum(-1) * area[:, None]
+    evidence = torch.where(body.limbs.any(-1), evidence, 0.0)
+    log_weights = belief.weight.clamp_min(1e-30).log()
+    seen = _tilted(body.tilt, *posterior)
+    pose = _tilted(body.tilt, joints, covs) if body.whole else seen
     return FramePose(
-        joints @ body.tilt.mT, tilt @ covs @ tilt.mT, (joints + apart) @ body.tilt.mT,
-        tilt @ mean_covs @ tilt.mT, body.turn, body.tilt, evidence, weight, body.bones.metres,
-        body.bones.covs,
-    )  # fmt: skip
+        *pose, *seen, body.tilt @ axes.mT, evidence, log_weights, body.bones.metres, body.bones.covs
+    )
+
+
+def _tilted(
+    tilt: Float[Tensor, "B 3 3"], joints: Float[Tensor, "B 8 3"], covs: Float[Tensor, "B 8 3 3"]
+) -> tuple[Float[Tensor, "B 8 3"], Float[Tensor, "B 8 3 3"]]:
+    """Return joints and their covariances in the axes of a camera that is not rolled."""
+    back = tilt.mT
+    return joints @ back, tilt[:, None] @ covs @ back[:, None]
 
 
 def _with_lengths(
@@ -154,49 +162,52 @@ def _with_lengths(
     """
     elbow, hand = means.unbind(-2)
     upper_arm, forearm = lengths[:, None, :2, None].unbind(-2)
-    upper = upper_arm * normalize(elbow, dim=-1)
-    lower = forearm * normalize(hand - upper, dim=-1)
+    both = elbow + hand
+    upper = _along(elbow, upper_arm)
+    lower = _along(hand - upper, forearm)
     for _ in range(_ROUNDS):
-        upper = upper_arm * normalize(elbow + hand - lower, dim=-1)
-        lower = forearm * normalize(hand - upper, dim=-1)
+        upper = _along(both - lower, upper_arm)
+        lower = _along(hand - upper, forearm)
     return torch.stack([upper, upper + lower], -2)
 
 
-@cache
-def _limb_rows(device: torch.device) -> Int[Tensor, "4"]:
-    """Return the rows of both elbows and both hands."""
-    with outside_inference():
-        return torch.tensor([*ELBOWS, *HANDS], device=device)
+def _along(vectors: Float[Tensor, "*batch 3"], length: Float[Tensor, "*#batch 1"]) -> Tensor:
+    """Return vectors of the same directions and of these lengths."""
+    own = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return vectors * (length / own.clamp_min(1e-12))
 
 
-def _trust(known: Bool[Tensor, "B 8"], exact: Bool[Tensor, " B"]) -> Float[Tensor, "B 2"]:
+def _trust(
+    shoulders: Bool[Tensor, "B 2"], limbs: Bool[Tensor, "B 2 2"], exact: Bool[Tensor, " B"]
+) -> Float[Tensor, "B 2"]:
     """Return the factors on the covariances of both arms, by which of their joints are measured."""
-    shoulder, elbow, hand = (known[:, rows] for rows in (SHOULDERS, ELBOWS, HANDS))
-    one = torch.ones(elbow.shape, device=known.device)
-    trust = torch.where(hand & ~elbow, _HAND_ALONE, one)
-    trust = torch.where(shoulder & elbow & hand, _WHOLE, trust)
-    return torch.where(exact[:, None], trust, one)
+    elbow, hand = limbs.unbind(-1)
+    trust = torch.where(hand & ~elbow, _HAND_ALONE, 1.0)
+    trust = trust.masked_fill(shoulders & elbow & hand, _WHOLE)
+    return trust.masked_fill(~exact[:, None], 1.0)
 
 
 def _covs(
     body: SeenBody, joints: Float[Tensor, "B 8 3"], spread: Float[Tensor, "B 4 3 3"]
-) -> Float[Tensor, "B 8 3 3"]:
-    """Return the covariances of the joints: posterior spread, stiffness of the torso, and common scale.
+) -> tuple[Float[Tensor, "B 8 3 3"], Float[Tensor, "B 4 3 3"]]:
+    """Return the covariances of joints by stiffness of the torso and common scale, and all those of `LIMBS`.
+
+    Limbs have the spread of the posterior too.
 
     Args:
-        body: the body but for its arms. joints: all of its joints. spread: that of both elbows, then both
-            hands, over the posterior.
+        body: the body but for its arms. joints: all of its joints. spread: that of the limbs.
     """
     apart = joints - joints[:, _NECK, None]
     outer = apart[..., :, None] * apart[..., None, :]
     still = _STD**2 * torch.eye(3, dtype=joints.dtype, device=joints.device)
     covs = still + body.scale.square()[:, None, None, None] * outer
+    rows = index_tensor(LIMBS, joints.device)
+    limbs = covs.index_select(1, rows) + spread + body.others
     # seen hands are as far from shoulders that are not as the body is away
-    inferred = body.far[:, None] * ~body.known[:, SHOULDERS]
-    flat = torch.nn.functional.pad(outer[:, HANDS, :2, :2], (0, 1, 0, 1))
-    limbs = spread + body.others
-    limbs = torch.cat([limbs[:, :2], limbs[:, 2:] + inferred[..., None, None] * flat], 1)
-    return covs.index_add(1, _limb_rows(joints.device), limbs)
+    inferred = body.far[:, None] * ~body.shoulders
+    hands = limbs.view(-1, 2, 2, 3, 3)[:, :, 1, :2, :2]
+    hands += inferred[..., None, None] * outer[:, HANDS, :2, :2]
+    return covs, limbs
 
 
 def estimates_of(
@@ -211,31 +222,32 @@ def estimates_of(
         poses: the poses of some frames of all B sequences at a time, [B T', ...]. batch_size: B.
         matrix: K of the prior's camera. names: the names of the bone lengths.
     """
-    stacked = FramePose(*(
-        torch.cat([value.unflatten(0, (batch_size, -1)) for value in values], 1)
-        for values in zip(*poses, strict=True)
-    ))  # fmt: skip
+    stacked = FramePose(*(_of_sequences(values, batch_size) for values in zip(*poses, strict=True)))
     neck = stacked.joints[:, :, _NECK]
-    lean = torch.atan2(stacked.tilt[..., 1, 0], stacked.tilt[..., 0, 0])
-    angles = torch.stack([lean, torch.zeros_like(lean), stacked.turn], -1)
-    back = upright_axes(stacked.turn) @ stacked.tilt.mT
-    joints = (stacked.joints - neck[:, :, None]) @ back.mT
-    covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
     # measured joints are seen where they are measured, though bones that are unsure keep their lengths
     seen = stacked.means @ matrix.mT
     uv = seen[..., :2] / seen[..., 2:]
     uv_covs = _pixel_covs(stacked.means, stacked.mean_covs, matrix)
-    failed_at = first_not_finite(joints.flatten(2))
+    joints = stacked.joints.flatten(2)
+    failed_at = first_not_finite(joints)
     left, right = (
-        FilterOutput(
-            joints.flatten(2), stacked.log_weights[:, :, arm], stacked.log_evidence[:, :, arm], None,
-            failed_at,
+        FilterOutput(joints, log_weights, log_evidence, None, failed_at)
+        for log_weights, log_evidence in zip(
+            stacked.log_weights.unbind(2), stacked.log_evidence.unbind(2), strict=True
         )
-        for arm in (0, 1)
+    )
+    found = CameraPoses(
+        stacked.joints, stacked.covs, stacked.rotation[:, :, None], torch.ones_like(neck[..., :1]),
+        neck, uv, uv_covs,
     )  # fmt: skip
-    reading = ReadOut(joints, covs, angles, neck, uv, uv_covs)
     bones = Bones(names, stacked.bones, stacked.bone_covs)
-    return Estimates(left, right, None, reading, bones)
+    return Estimates(left, right, None, found, bones)
+
+
+def _of_sequences(values: Sequence[Tensor], batch_size: int) -> Tensor:
+    """Return values of some frames of all sequences at a time, [B T', ...], as those of all frames."""
+    parts = [value.unflatten(0, (batch_size, -1)) for value in values]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 def _pixel_covs(
@@ -245,7 +257,7 @@ def _pixel_covs(
 ) -> Float[Tensor, "*batch 2 2"]:
     """Return the covariances of the joints' pixels, to first order."""
     depth = joints[..., 2:].clamp_min(0.1)
-    eye = torch.eye(2).to(joints).expand(*joints.shape[:-1], 2, 2)
-    slopes = torch.cat([eye, -(joints[..., :2] / depth)[..., None]], -1) / depth[..., None]
-    slopes = matrix[:2, :2] @ slopes
+    slope = matrix[:2, :2]
+    away = -(joints[..., :2] / depth) @ slope.mT
+    slopes = torch.cat([slope.expand(*away.shape, 2), away[..., None]], -1) / depth[..., None]
     return slopes @ covs @ slopes.mT

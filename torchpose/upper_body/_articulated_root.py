@@ -18,7 +18,7 @@ from torchpose.upper_body._articulated_torso import shoulder_places
 from torchpose.upper_body._body_lengths import BodyLengths, Sizes
 from torchpose.upper_body._face_points import face_evidence
 from torchpose.upper_body._root_grid import RootGrid
-from torchpose.upper_body._torso_likelihood import Root, Torso, middle_of_shoulders
+from torchpose.upper_body._torso_likelihood import Root, middle_of_shoulders
 
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
@@ -31,26 +31,17 @@ class Roots(NamedTuple):
 
     Attributes:
         root: the M likeliest hypotheses. near: the share of each in the estimate, [B, M].
+        mean: the mean of all with these shares, as the only hypothesis.
         middle: the middle of the shoulders given each, [B, M, 3]. shoulders: their places, [B, 2, M, 3].
         directions: the mean directions of both arms given each, [B, 2, M, 6].
     """
 
     root: Root
     near: Tensor
+    mean: Root
     middle: Tensor
     shoulders: Tensor
     directions: Tensor
-
-    @property
-    def mean(self) -> Root:
-        """Return the mean of the hypotheses with their shares in the estimate, as the only one."""
-        root, near = self.root, self.near
-        best = root.turn.gather(1, near.argmax(1, keepdim=True))
-        off = within_half_turn(root.turn - best)
-        depth = (near * root.depth.log()).sum(1, keepdim=True).exp()
-        size = (near * root.size.log()).sum(1, keepdim=True).exp()
-        turn = best + (near * off).sum(1, keepdim=True)
-        return Root(depth, turn, size, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
 
 class _Weighed(NamedTuple):
@@ -118,13 +109,15 @@ class RootStep(NamedTuple):
             evidence = evidence - against.flatten(1).gather(1, root.cell)
         belief = self.grid.belief(believed, root, evidence, frame.given.extrapolates)
         root = root._replace(log_weight=root.log_weight + evidence)
-        return belief, Roots(root, _shares_of_mode(root), middle, shoulders, arms.mean_directions)
+        near = _shares_of_mode(root)
+        mean = _mean_of(root, near)
+        return belief, Roots(root, near, mean, middle, shoulders, arms.mean_directions)
 
     def _weighed(
         self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
     ) -> _Weighed:
         """Return the arms given each hypothesis of the root, and their log-evidence."""
-        middle = self.middle(frame.torso, root, last, sizes)
+        middle = self.middle(frame, root, last, sizes)
         shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
         arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
         area = 2 * frame.given.limbs.sum(2)[..., None] * root.depth.log()[:, None]
@@ -132,10 +125,13 @@ class RootStep(NamedTuple):
         return _Weighed(middle, shoulders, arms, both, arms.log_evidence + area)
 
     def middle(
-        self, torso: Torso, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
+        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
     ) -> Float[Tensor, "B M 3"]:
         """Return the middle of the shoulders; on its last ray where no joint of the torso is measured."""
+        torso = frame.torso
         found = middle_of_shoulders(torso, root, sizes.torso)
+        if frame.facts.placed:
+            return found
         before = (last / last[:, 2:])[:, None] * root.depth[..., None]
         return torch.where(torso.known.any(1)[:, None, None], found, before)
 
@@ -169,7 +165,7 @@ class RootStep(NamedTuple):
 
 
 def covs_of_roots(roots: Roots, lengths: Float[Tensor, "B 4"]) -> Float[Tensor, "B 4 3 3"]:
-    """Return the covariances of both elbows, then both hands, over the hypotheses of the root.
+    """Return the covariances of elbow and hand of the left arm, then the right, over the hypotheses.
 
     They are the second moments about the mean of the hypotheses near the likeliest turn.
     """
@@ -178,7 +174,7 @@ def covs_of_roots(roots: Roots, lengths: Float[Tensor, "B 4"]) -> Float[Tensor, 
     bones = bones_of(roots.directions, upright_axes(root.turn)[:, None], lengths)
     ends = shoulder[..., None, :] + bones.cumsum(-2)
     used = (near[:, None, :, None, None] * ends).sum(2, keepdim=True)
-    off = (ends - used).permute(0, 3, 1, 2, 4).flatten(1, 2)
+    off = (ends - used).transpose(2, 3).flatten(1, 2)
     weight = torch.softmax(root.log_weight, 1)[:, None, :, None]
     return (weight * off).mT @ off
 
@@ -210,6 +206,16 @@ def _arm_input(
         shoulder, middle, rays, given.limbs, frame.facts.patterns,
         noise[:, :, None] * depth.square() + loose, axes, bones, borders, given.log_inside,
     )  # fmt: skip
+
+
+def _mean_of(root: Root, near: Float[Tensor, "B M"]) -> Root:
+    """Return the mean of hypotheses with these shares."""
+    best = root.turn.gather(1, near.argmax(1, keepdim=True))
+    off = within_half_turn(root.turn - best)
+    depth = (near * root.depth.log()).sum(1, keepdim=True).exp()
+    size = (near * root.size.log()).sum(1, keepdim=True).exp()
+    turn = best + (near * off).sum(1, keepdim=True)
+    return Root(depth, turn, size, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
 
 def _shares_of_mode(root: Root) -> Float[Tensor, "B M"]:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK
-from torchpose.upper_body._articulated_frame import SHOULDERS, UprightFrame
+from torchpose.upper_body._articulated_frame import UprightFrame
 from torchpose.upper_body._face_points import head_in_face
 from torchpose.upper_body._torso_likelihood import (
     Root,
     TorsoLengths,
     half_widths,
     shoulder_offsets,
-    spine_places,
 )
 
-_SPINE = [UPPER_BODY.index("neck"), UPPER_BODY.index("head")]
+_BESIDE = UPPER_BODY.index("shoulder_left")  # rows of limbs before, and after, those of the torso
 
 
 def shoulder_places(
@@ -61,20 +61,17 @@ def torso_joints(
     neck, head = _spine(frame, root, middle, lengths, angles)
     if neck_between:
         neck = shoulders.mean(1).lerp(head, KINECT_NECK.fraction)
-    joints = middle.new_zeros(len(middle), len(UPPER_BODY), 3)
-    joints[:, SHOULDERS] = shoulders
-    joints[:, _SPINE] = torch.stack([neck, head], 1)
-    return joints
+    left, right = shoulders.unbind(1)
+    return pad(torch.stack([left, head, neck, right], 1), (0, 0, _BESIDE, _BESIDE))
 
 
 def _spine(
     frame: UprightFrame, root: Root, middle: Tensor, lengths: TorsoLengths, angles: Tensor
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
     """Return neck and head: on their rays where they are measured, the head else by its face."""
-    upright = middle + spine_places(lengths) * root.size[..., None]
-    ray = frame.rays[:, _SPINE]
+    upright = middle + lengths.spine * root.size[..., None]
+    ray, known = frame.torso.rays[:, 2:], frame.torso.known[:, 2:, None]
     on_ray = ray / ray[..., 2:] * upright[..., 2:]
-    known = frame.given.known[:, _SPINE, None]
     neck, head = torch.where(known, on_ray, upright).unbind(1)
     if frame.face is not None:
         std, depth, turn = frame.given.std.amin(1), upright[:, 1, 2], root.turn[:, 0]

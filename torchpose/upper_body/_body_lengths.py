@@ -121,7 +121,10 @@ class BodyLengths:
             self._measure(known.lengths)
         self.surest = int(self.spread.argmin())
         # the surest length is that of the common scale, which moves no pixel
-        self._unsure = like.new_tensor([float(i != self.surest) for i in range(2)])
+        self._own = like.new_tensor([float(i != self.surest) for i in range(4)])
+        self._unsure = self._own[:2]
+        torso = like.new_tensor([0.0, 0.0, 1.0, 1.0])
+        self._torso = torso[:, None] * torso  # which pairs of lengths are both of the torso
         steps = torch.eye(2, 4, dtype=like.dtype, device=like.device) * _NUDGE
         self._nudges = torch.cat([torch.zeros_like(steps[:1]), steps, -steps])
 
@@ -220,19 +223,16 @@ class BodyLengths:
             lengths: the belief given the size. size: the size of the torso. unsure: the variance of its
                 log.
         """
-        own = lengths.precision.reciprocal()
-        own[:, self.surest] = 0.0
-        torso = own.new_tensor([0.0, 0.0, 1.0, 1.0])
-        logs = torch.diag_embed(own) + self.scale.square()
-        logs = logs + unsure[:, None, None] * torso[:, None] * torso
-        metres = self.metres(lengths) * size[:, None] ** torso
+        own = torch.diag_embed(lengths.precision.reciprocal() * self._own)
+        logs = torch.addcmul(own + self.scale.square(), unsure[:, None, None], self._torso)
+        metres = self.metres(lengths) * size[:, None] ** self._torso[-1]
         return Bones(self.names, metres - self.lower, metres[:, :, None] * logs * metres[:, None])
 
     def sizes(self, lengths: Lengths) -> Sizes:
         """Return the lengths as other filters take them."""
         metres = self.metres(lengths)
         std = metres * lengths.precision.rsqrt()
-        torso = TorsoLengths(metres[:, 2], metres[:, 3], std[:, 2], std[:, 3], self.neck)
+        torso = TorsoLengths.of(metres[:, 2], metres[:, 3], std[:, 2], std[:, 3], self.neck)
         return Sizes(metres, std[:, :2] * self._unsure, torso)
 
     def learn(

@@ -14,6 +14,11 @@ from torchpose.camera._virtual_camera import BodyView
 from torchpose.errors import CameraError, PriorError
 from torchpose.filters._outputs import FilterOutput, StepOutput
 from torchpose.filters._recursive_filter import Generators
+from torchpose.math._rotations import (
+    matrix_to_quaternion_vector,
+    mean_rotation,
+    quaternion_vector_to_matrix,
+)
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
 from torchpose.upper_body._measured_joints import MeasuredJoints
@@ -94,7 +99,7 @@ def check_model(
 
 
 class ReadOut(NamedTuple):
-    """Poses, with the rotation and the place of the body.
+    """Poses in the axes of the body, with its rotation and its place.
 
     Attributes:
         joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
@@ -109,6 +114,34 @@ class ReadOut(NamedTuple):
     place: Tensor
     uv: Tensor
     uv_covs: Tensor
+
+
+class CameraPoses(NamedTuple):
+    """Poses in the axes of the camera.
+
+    Attributes:
+        joints: [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
+        rotations: from the axes of the body to those of the camera, by each of N models, [B, T, N, 3, 3].
+        shares: the weights of these models, [B, T, N].
+        place: the body's centre [B, T, 3], metres.
+        uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
+    """
+
+    joints: Tensor
+    covs: Tensor
+    rotations: Tensor
+    shares: Tensor
+    place: Tensor
+    uv: Tensor
+    uv_covs: Tensor
+
+    @property
+    def rotation(self) -> Float[Tensor, "B T 3 3"]:
+        """Return the rotation from the axes of the body to those of the camera: the mean of the models'."""
+        if self.rotations.shape[2] == 1:
+            return self.rotations[:, :, 0]
+        vectors = matrix_to_quaternion_vector(self.rotations)
+        return quaternion_vector_to_matrix(mean_rotation(vectors, self.shares))
 
 
 class Bones(NamedTuple):
@@ -131,14 +164,15 @@ class Estimates(NamedTuple):
         left, right: the states of each arm with covariances, float64; the first 21 dimensions are those
             of `torchpose.priors._arm_state`.
         view: the virtual camera in whose pixels the states are; None is the prior's camera.
-        reading: the poses, by estimators that do not estimate the states of single arms; else None.
+        poses: by estimators that do not estimate the states of single arms; no motion stage follows. Else
+            None.
         bones: the lengths of bones [B, T, K], by estimators that learn them; else None.
     """
 
     left: FilterOutput
     right: FilterOutput
     view: BodyView | None = None
-    reading: ReadOut | None = None
+    poses: CameraPoses | None = None
     bones: Bones | None = None
 
 
@@ -292,19 +326,19 @@ def repeat_last(estimates: Estimates, lengths: Int[Tensor, " B"] | None) -> Esti
     if lengths is None or bool((lengths >= n_frames).all()):
         return estimates
     lengths = lengths.to(estimates.left.mean.device)
-    view, reading, bones = estimates.view, estimates.reading, estimates.bones
+    view, poses, bones = estimates.view, estimates.poses, estimates.bones
     return Estimates(
         _repeat_output(estimates.left, lengths),
         _repeat_output(estimates.right, lengths),
         None if view is None else BodyView(*_held(view, lengths)),
-        None if reading is None else repeat_reading(reading, lengths),
+        None if poses is None else repeat_poses(poses, lengths),
         None if bones is None else Bones(bones.names, *_held(bones[1:], lengths)),
     )
 
 
-def repeat_reading(reading: ReadOut, lengths: Int[Tensor, " B"]) -> ReadOut:
+def repeat_poses(poses: CameraPoses, lengths: Int[Tensor, " B"]) -> CameraPoses:
     """Return the poses with the last one of each sequence repeated past its length."""
-    return ReadOut(*_held(reading, lengths))
+    return CameraPoses(*_held(poses, lengths))
 
 
 def _repeat_output(out: FilterOutput, lengths: Int[Tensor, " B"]) -> FilterOutput:
@@ -341,7 +375,10 @@ def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
 
 def in_double(out: FilterOutput) -> FilterOutput:
     """Return the estimates in float64, in which poses are read out of them."""
-    wide = [v.double() if v is not None and v.is_floating_point() else v for v in out]
+    wide = [
+        v.double() if v is not None and v.is_floating_point() and v.dtype != torch.float64 else v
+        for v in out
+    ]
     return FilterOutput(*wide)  # type: ignore[arg-type]
 
 

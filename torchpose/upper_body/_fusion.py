@@ -13,22 +13,27 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.facade import set_up_facade
-from torchpose._core.module_state import derived, outside_inference
+from torchpose._core.module_state import derived, index_tensor, outside_inference
 from torchpose.camera._projection import (
     arm_in_body_frame,
     join_arms,
+    joint_blocks,
     lift,
     pixel_covariances,
-    project,
 )
-from torchpose.camera._virtual_camera import from_view, view_jacobian
+from torchpose.camera._virtual_camera import from_view
 from torchpose.filters._constant_velocity import ConstantVelocityFilter, ConstantVelocityState
-from torchpose.filters._outputs import FilterOutput
 from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import onto_torso
-from torchpose.upper_body._estimator import Estimates, MotionRatios, ReadOut, require_cov
+from torchpose.upper_body._estimator import (
+    CameraPoses,
+    Estimates,
+    MotionRatios,
+    ReadOut,
+    require_cov,
+)
 
 _LIMB_ENDS = tuple(
     UPPER_BODY.index(f"{j}_{s}") for j in ("hand", "elbow") for s in ("left", "right")
@@ -48,58 +53,54 @@ def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: Rotation
         estimates: the estimates of both arms. matrix: K of the prior's camera. order: the order of roll,
             pitch and yaw.
     """
-    if estimates.reading is not None:
-        return estimates.reading
-    left, right, view = estimates[:3]
-    outputs = left, right
-    means = [out.mean[..., :STATE_DIM] for out in outputs]
-    covs = [require_cov(out)[..., :STATE_DIM, :STATE_DIM] for out in outputs]
-    if left.mean.shape[-1] > STATE_DIM:
-        joints, joint_covs = _on_torso(left, right, matrix, order)
+    outputs, view = estimates[:2], estimates.view
+    mean = torch.stack([out.mean for out in outputs], 2)  # both arms: [B, T, 2, D]
+    cov = torch.stack([require_cov(out) for out in outputs], 2)
+    state, state_cov = mean[..., :STATE_DIM], cov[..., :STATE_DIM, :STATE_DIM]
+    if mean.shape[-1] > STATE_DIM:
+        uv, joints, joint_covs = _on_torso(mean, cov, matrix, order)
     else:
-        lifted = [
-            arm_in_body_frame(mean, cov, matrix, order)
-            for mean, cov in zip(means, covs, strict=True)
-        ]
-        joints = join_arms(*(joints for joints, _ in lifted))
-        joint_covs = join_arms(*(cov for _, cov in lifted))
-    camera = (means[0][..., 15:] + means[1][..., 15:]) / 2
-    angles, place = camera[..., :3], camera[..., 3:]
-    uv = join_arms(*(mean[..., :15].unflatten(-1, (5, 3))[..., :2] for mean in means))
-    uv_covs = join_arms(*(pixel_covariances(cov) for cov in covs))
+        lifted = arm_in_body_frame(state, state_cov, matrix, order)
+        seen = state[..., :15].unflatten(-1, (5, 3))
+        uv, joints, joint_covs = (_joined(values) for values in (seen, *lifted))
+    angles, place = state[..., 15:].mean(2).split(3, -1)
+    uv, uv_covs = uv[..., :2], _joined(pixel_covariances(state_cov))
     if view is not None:
         back = view.rotation.mT
         angles = matrix_to_euler(back @ euler_to_matrix(angles, order), order)
         place = (back @ place[..., None])[..., 0] * view.zoom[..., None]
-        slopes = view_jacobian(uv, view, matrix)
-        uv, uv_covs = from_view(uv, view, matrix), slopes @ uv_covs @ slopes.mT
+        uv, slopes = from_view(uv, view, matrix)
+        uv_covs = slopes @ uv_covs @ slopes.mT
     return ReadOut(joints, joint_covs, angles, place, uv, uv_covs)
 
 
+def _joined(arms: Float[Tensor, "B T 2 5 *rest"]) -> Float[Tensor, "B T 8 *rest"]:
+    """Return the eight joints of both arms (`join_arms`)."""
+    return join_arms(*arms.unbind(2))
+
+
 def _on_torso(
-    left: FilterOutput, right: FilterOutput, matrix: Tensor, order: RotationOrder
-) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
-    """Return joints that were estimated in the axes of the torso, turned into those of the body.
+    mean: Float[Tensor, "B T 2 36"],
+    cov: Float[Tensor, "B T 2 36 36"],
+    matrix: Tensor,
+    order: RotationOrder,
+) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
+    """Return (u, v, depth) and joints, which were estimated in the axes of the torso, in those of the body.
 
     The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
     """
-    mean = torch.stack([left.mean, right.mean])
-    cov = torch.stack([require_cov(left), require_cov(right)])
-    rotation = euler_to_matrix(mean[..., 15:18], order)
-    joints = mean[..., :15].unflatten(-1, (5, 3))
-    lifted = lift(joints, matrix, rotation, mean[..., 18:STATE_DIM])
-    pose = mean[..., STATE_DIM:].unflatten(-1, (5, 3))
-    blocks = cov[..., STATE_DIM:, STATE_DIM:].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
-    covs = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
-    return onto_torso(join_arms(*pose), join_arms(*covs), join_arms(*lifted))
+    # five joints (u, v, depth), angles and place, and five joints in the torso's axes
+    seen, camera, own = mean.unflatten(-1, (-1, 3)).split([5, 2, 5], -2)
+    angles, place = camera.unbind(-2)
+    lifted = lift(seen, matrix, euler_to_matrix(angles, order), place)
+    uv, pose, joints = _joined(torch.cat([seen, own, lifted], -1)).split(3, -1)
+    covs = _joined(joint_blocks(cov[..., STATE_DIM:, STATE_DIM:]))
+    return uv, *onto_torso(pose, covs, joints)
 
 
 def on_their_rays(
-    reading: ReadOut,
-    matrix: Float[Tensor, "3 3"],
-    order: RotationOrder,
-    observed: Bool[Tensor, "B T 8"],
-) -> ReadOut:
+    poses: CameraPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
+) -> CameraPoses:
     """Return measured limbs on their rays, and the other joints' pixels where they project to.
 
     Pixels and the joints in space are two readings of one mixture, linear each, and differ where a
@@ -109,19 +110,17 @@ def on_their_rays(
     Head, neck and shoulders stay, since the body hangs on them.
 
     Args:
-        reading: the poses of windows. matrix: K of the prior's camera. order: the order of the angles.
-        observed: which joints were measured.
+        poses: the poses of windows. matrix: K of the prior's camera. observed: which joints were measured.
     """
-    rotation = euler_to_matrix(reading.angles, order)
-    seen = project(reading.joints, matrix, rotation, reading.place)
-    before = seen[..., 2:] > _NEAREST
-    hand = observed[..., list(_HAND_OF)]
-    projected = (hand & ~observed)[..., None] & before
-    uv = torch.where(projected, seen[..., :2], reading.uv)
-    moved = lift(torch.cat([uv, seen[..., 2:]], -1), matrix, rotation, reading.place)
-    limb = _limb_ends(uv.device) & observed[..., None]
-    joints = torch.where(limb & before, moved, reading.joints)
-    return reading._replace(joints=joints, uv=uv)
+    depth, known = poses.joints[..., 2:], observed[..., None]
+    before = depth > _NEAREST
+    hands = known.index_select(2, index_tensor(_HAND_OF, known.device))
+    seen = poses.joints @ matrix.mT
+    uv = torch.where(hands & ~known & before, seen[..., :2] / depth, poses.uv)
+    pixels = torch.nn.functional.pad(uv, (0, 1), value=1.0)
+    moved = depth * torch.linalg.solve_triangular(matrix.mT, pixels, upper=False, left=False)
+    joints = torch.where(_limb_ends(uv.device) & known & before, moved, poses.joints)
+    return poses._replace(joints=joints, uv=uv)
 
 
 @cache
@@ -132,26 +131,35 @@ def _limb_ends(device: torch.device) -> Bool[Tensor, "8 1"]:
         return torch.tensor(rows, device=device)
 
 
-def in_camera_axes(
-    reading: ReadOut, order: RotationOrder, place: Float[Tensor, "*batch 3"] | None = None
-) -> ReadOut:
-    """Return the joints and their covariances turned into the camera's axes and put where they are.
+def in_camera_axes(reading: ReadOut, order: RotationOrder) -> CameraPoses:
+    """Return poses turned into the camera's axes and put where they are.
 
     Args:
-        reading: poses in the body's frame. order: the order of their angles. place: the place of every
-            body, metres, instead of the estimated one.
+        reading: poses in the body's axes. order: the order of their angles.
     """
-    return turned(reading, euler_to_matrix(reading.angles, order), place)
+    rotations = euler_to_matrix(reading.angles, order)[:, :, None]
+    back = rotations.mT
+    joints = reading.joints @ back[:, :, 0] + reading.place[:, :, None]
+    shares = torch.ones_like(reading.place[..., :1])
+    return CameraPoses(
+        joints, rotations @ reading.covs @ back, rotations, shares, reading.place, reading.uv,
+        reading.uv_covs,
+    )  # fmt: skip
 
 
-def turned(
-    reading: ReadOut, rotation: Float[Tensor, "*batch 3 3"], place: Tensor | None = None
-) -> ReadOut:
-    """Return the result of `in_camera_axes` for the rotation matrices of the angles."""
-    at = reading.place if place is None else place.to(reading.place).expand_as(reading.place)
-    joints = reading.joints @ rotation.mT + at[..., None, :]
-    rotation = rotation[..., None, :, :]
-    return reading._replace(joints=joints, covs=rotation @ reading.covs @ rotation.mT)
+def in_body_axes(poses: CameraPoses) -> CameraPoses:
+    """Return joints and covariances turned into the axes of the body, whose centre is their origin."""
+    rotation = poses.rotation
+    turn = rotation[:, :, None]
+    joints = (poses.joints - poses.place[:, :, None]) @ rotation
+    return poses._replace(joints=joints, covs=turn.mT @ poses.covs @ turn)
+
+
+def put_at(poses: CameraPoses, place: Float[Tensor, "3"]) -> CameraPoses:
+    """Return poses whose bodies are all at one place, metres, in camera axes."""
+    at = place.to(poses.place)
+    joints = poses.joints + (at - poses.place)[:, :, None]
+    return poses._replace(joints=joints, place=at.expand_as(poses.place))
 
 
 def calibration_mode(method: str) -> str:

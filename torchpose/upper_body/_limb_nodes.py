@@ -69,7 +69,7 @@ def nodes_on_ray(
     off = (rho - length[..., None] * cos[:, 0]) / std[..., None]
     step = math.log(math.radians(2 * _STEEPEST / (n_nodes - 1)))
     constant = step - 0.5 * math.log(2 * math.pi) - (std * length).log()
-    log_weight = constant[..., None] - 0.5 * off.square()
+    log_weight = constant[..., None].sub(off.square(), alpha=0.5)
     return LimbNodes(start, length, directions, log_weight)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_covariance, check_finite, check_floating, check_shape
-from torchpose._core.module_state import derived
+from torchpose._core.module_state import derived, index_tensor
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
@@ -192,15 +192,15 @@ def measure_joints(
         indices: the places of the eight joints among the keypoints, -1 if absent. cov: R at full
             confidence. own_cov: R of every single keypoint instead.
     """
-    picked = [max(i, 0) for i in indices]
-    present = torch.tensor([i >= 0 for i in indices], device=measured.device)
-    measured = measured[:, :, picked] & present
-    uv = torch.where(measured[..., None], keypoints[:, :, picked], keypoints.new_zeros(()))
+    picked = index_tensor(tuple(max(i, 0) for i in indices), measured.device)
+    present = index_tensor(tuple(i >= 0 for i in indices), measured.device).bool()
+    measured = measured.index_select(2, picked) & present
+    uv = torch.where(measured[..., None], keypoints.index_select(2, picked), 0.0)
     if own_cov is not None:
         cov = torch.where(measured[..., None, None], own_cov.to(cov)[:, :, picked], cov)
     if confidence is not None:
         weight = confidence.to(uv)[:, :, picked].nan_to_num(1.0).clamp(_LEAST_CONFIDENCE, 1.0)
-        weight = torch.where(measured, weight, torch.ones_like(weight))
+        weight = weight.masked_fill(~measured, 1.0)
         if bool((weight < 1).any()):
             cov = cov / weight[..., None, None]
             return MeasuredJoints(uv, measured, cov, confidence=weight)

@@ -11,41 +11,33 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.filters._outputs import first_not_finite
-from torchpose.math._rotations import (
-    RotationOrder,
-    euler_to_matrix,
-    matrix_to_euler,
-    matrix_to_quaternion_vector,
-    mean_rotation,
-    quaternion_vector_to_matrix,
-)
+from torchpose.math._rotations import RotationOrder
 from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,
+    CameraPoses,
     Estimates,
     Estimator,
-    ReadOut,
     TrackerModel,
     repeat_last,
 )
 from torchpose.upper_body._fusion import (
     MotionStage,
     MotionStageState,
+    in_camera_axes,
     kept_stage,
     on_their_rays,
     read_out,
     recalibrated,
     stage_lag,
-    turned,
 )
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
-_LIMBS = [*ELBOWS, *HANDS]
 _MEMORY = 4.0  # seconds after which evidence counts for 1/e
 _SHARE = 0.5  # of the mean evidence of a frame that counts: frames are alike, so many are as few
 _FIRST = 0.5  # log-odds of windows before the first frame
@@ -128,7 +120,8 @@ class MultipleModelFilter(Estimator):
         if self._stage is not None:
             motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
         sums = self._sums(state.ratios, _log_ratios(seen, bodies, measured))
-        mixed = self._mixed(sums, reading, seen, bodies, measured)
+        poses = in_camera_axes(reading, self.order)
+        mixed = self._mixed(sums, poses, seen, bodies, measured)
         return MultipleModelState(windows, articulated, motion, sums[:, -1]), mixed
 
     def forward(
@@ -149,11 +142,11 @@ class MultipleModelFilter(Estimator):
             return super().forward(measured, joints, arm_generators, lengths, progress)
         seen = told = self.windows.forward(measured, joints, arm_generators, lengths)
         bodies = self.articulated.forward(measured, joints, arm_generators, lengths, progress)
-        reading = self._steadied(seen, lengths)
+        poses = self._steadied(seen, lengths)
         if self.causal is not self.windows:
             told = self.causal.forward(measured, joints, arm_generators, lengths)
-            half = torch.full_like(reading.place[..., 0], 0.5)
-            reading = _averaged(half, reading, self._steadied(told, lengths), self.order)
+            half = torch.full_like(poses.place[..., 0], 0.5)
+            poses = _averaged(half, poses, self._steadied(told, lengths))
         ratios = _log_ratios(told, bodies, measured)
         if lengths is not None:
             frames = torch.arange(ratios.shape[1], device=ratios.device)
@@ -161,14 +154,14 @@ class MultipleModelFilter(Estimator):
         none = ratios.new_zeros(len(ratios), 2)
         sums = self._sums(none, ratios)
         sums = sums + self._later_sums(ratios) - ratios
-        return repeat_last(self._mixed(sums, reading, seen, bodies, measured), lengths)
+        return repeat_last(self._mixed(sums, poses, seen, bodies, measured), lengths)
 
-    def _steadied(self, seen: Estimates, lengths: Tensor | None) -> ReadOut:
+    def _steadied(self, seen: Estimates, lengths: Tensor | None) -> CameraPoses:
         """Return the poses of windows over whole sequences, after their motion stage."""
-        reading = read_out(seen, self.matrix, self.order)
-        if self._stage is None:
-            return reading
-        return self._stage(reading, lengths, stage_lag(self.model.smoothing, self.windows.ahead))
+        reading, stage = read_out(seen, self.matrix, self.order), self._stage
+        if stage is not None:
+            reading = stage(reading, lengths, stage_lag(self.model.smoothing, self.windows.ahead))
+        return in_camera_axes(reading, self.order)
 
     @property
     def _stage(self) -> MotionStage | None:
@@ -201,7 +194,7 @@ class MultipleModelFilter(Estimator):
     def _mixed(
         self,
         sums: Float[Tensor, "B T 2"],
-        reading: ReadOut,
+        poses: CameraPoses,
         seen: Estimates,
         bodies: Estimates,
         measured: MeasuredJoints,
@@ -210,18 +203,18 @@ class MultipleModelFilter(Estimator):
 
         Args:
             sums: the discounted sums of the log-likelihood ratios and of their weights.
-            reading: the poses of windows, after their motion stage.
+            poses: those of windows, after their motion stage.
             seen, bodies: the estimates of windows and of bones. measured: the measurements.
         """
-        if bodies.reading is None:
+        if bodies.poses is None:
             raise RuntimeError("an articulated filter reads its poses itself")
-        reading = on_their_rays(reading, self.matrix, self.order, measured.mask)
+        poses = on_their_rays(poses, self.matrix, measured.mask)
         if self.model.calibrated:
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
-            reading = reading._replace(covs=recalibrated(reading.covs, noise, mode))
+            poses = poses._replace(covs=recalibrated(poses.covs, noise, mode))
         mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
         share = torch.sigmoid(_FIRST + _SHARE * mean_ratio)
-        mixed = _averaged(share, reading, bodies.reading, self.order)
+        mixed = _averaged(share, poses, bodies.poses)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
             mixed = mixed._replace(covs=trust[..., None, None, None] * mixed.covs)
@@ -246,39 +239,32 @@ def _log_ratios(
 ) -> Float[Tensor, "B T 2"]:
     """Return the log-likelihood ratio of windows to bones for both arms, and 1 where a limb is measured."""
     ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (seen, bodies))
-    some = measured.mask[..., _LIMBS].any(-1)
+    some = (measured.mask[..., ELBOWS] | measured.mask[..., HANDS]).any(-1)
     apart = torch.where(some, (ours - theirs).nan_to_num(0.0), 0.0)
     return torch.stack([apart, some.to(apart)], -1)
 
 
-def _averaged(
-    share: Float[Tensor, "B T"], ours: ReadOut, theirs: ReadOut, order: RotationOrder
-) -> ReadOut:
-    """Return two readings averaged in camera axes, with the moments of a mixture.
+def _averaged(share: Float[Tensor, "B T"], ours: CameraPoses, theirs: CameraPoses) -> CameraPoses:
+    """Return the average of two poses, with the moments of a mixture.
 
     Args:
-        share: the weight of the first. ours, theirs: the two readings. order: the order of their angles.
+        share: the weight of the first. ours, theirs: the two.
     """
-    turns = euler_to_matrix(torch.stack([ours.angles, theirs.angles], -2), order)
-    vectors = matrix_to_quaternion_vector(turns)
-    seen = [turned(*pair) for pair in zip((ours, theirs), turns.unbind(-3), strict=True)]
-    mean = mean_rotation(vectors, torch.stack([share, 1 - share], -1))
-    rotation = quaternion_vector_to_matrix(mean)
+    both = ours, theirs
+    rotations = torch.stack([poses.rotation for poses in both], 2)
     place = theirs.place.lerp(ours.place, share[..., None])
-    back = rotation.mT[..., None, :, :]
-    joints, covs = _moments(share, *((reading.joints, reading.covs) for reading in seen))
-    uv, uv_covs = _moments(share, *((reading.uv, reading.uv_covs) for reading in (ours, theirs)))
-    joints = (joints - place[..., None, :]) @ rotation
-    angles = matrix_to_euler(rotation, order)
-    return ReadOut(joints, back @ covs @ back.mT, angles, place, uv, uv_covs)
+    weight = share[..., None, None]
+    joints, covs = _moments(weight, *((poses.joints, poses.covs) for poses in both))
+    uv, uv_covs = _moments(weight, *((poses.uv, poses.uv_covs) for poses in both))
+    shares = torch.stack([share, 1 - share], -1)
+    return CameraPoses(joints, covs, rotations, shares, place, uv, uv_covs)
 
 
 def _moments(
-    share: Float[Tensor, "B T"], ours: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]
+    weight: Float[Tensor, "B T 1 1"], ours: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Return mean and covariance of a mixture of two components, given theirs and the first one's weight."""
-    weight = share[..., None, None]
-    mean = theirs[0].lerp(ours[0], weight)
     apart = ours[0] - theirs[0]
-    spread = (weight * (1 - weight))[..., None] * apart[..., :, None] * apart[..., None, :]
-    return mean, theirs[1].lerp(ours[1], weight[..., None]) + spread
+    pulled = weight * apart
+    spread = pulled[..., :, None] * (apart - pulled)[..., None, :]
+    return theirs[0] + pulled, theirs[1].lerp(ours[1], weight[..., None]) + spread

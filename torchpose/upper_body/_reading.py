@@ -13,11 +13,12 @@ from torchpose.math._rotations import RotationOrder
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.upper_body._estimator import (
     Bones,
+    CameraPoses,
     Estimates,
     Estimator,
     first_failure,
     mending_notes,
-    repeat_reading,
+    repeat_poses,
 )
 from torchpose.upper_body._estimator_table import METHODS
 from torchpose.upper_body._fusion import (
@@ -25,8 +26,10 @@ from torchpose.upper_body._fusion import (
     MotionStageState,
     ReadOut,
     calibration_mode,
+    in_body_axes,
     in_camera_axes,
     on_their_rays,
+    put_at,
     read_out,
     recalibrated,
 )
@@ -81,17 +84,18 @@ class PoseReader(NamedTuple):
             lengths: of whole sequences, the number of frames of each, [B]; past it the last pose is
                 repeated. None is T.
         """
-        matrix = self.prior.info.matrix.to(estimates.left.mean)
-        motion, reading = self._steadied(
-            motion, read_out(estimates, matrix, self.order), estimates, lengths
-        )
-        reading = self._tilted(self._placed(reading, matrix, found.measured.mask), matrix)
-        if lengths is None:
-            lengths = torch.full((len(reading.uv),), reading.uv.shape[1], device=reading.uv.device)
-        else:
-            reading = repeat_reading(reading, lengths)
+        matrix, poses = self.prior.info.matrix.to(estimates.left.mean), estimates.poses
+        if poses is None:
+            reading = read_out(estimates, matrix, self.order)
+            motion, reading = self._steadied(motion, reading, estimates, lengths)
+            poses = in_camera_axes(reading, self.order)
+        poses = self._tilted(self._placed(poses, matrix, found.measured.mask), matrix)
         notes = self.notes + outlier_notes(found.probability, found.exchanged, lengths)
-        return motion, self._track(reading, estimates, found, lengths, notes)
+        if lengths is None:
+            lengths = torch.full((len(poses.uv),), poses.uv.shape[1], device=poses.uv.device)
+        else:
+            poses = repeat_poses(poses, lengths)
+        return motion, self._track(poses, estimates, found, lengths, notes)
 
     def _steadied(
         self,
@@ -117,7 +121,7 @@ class PoseReader(NamedTuple):
 
     def _track(
         self,
-        reading: ReadOut,
+        poses: CameraPoses,
         estimates: Estimates,
         found: Screened,
         lengths: Int[Tensor, " B"],
@@ -127,10 +131,10 @@ class PoseReader(NamedTuple):
         left, right = estimates.left, estimates.right
         _, to_camera = kept_pixel_maps(self.camera, self.prior)
         return PoseTrack(
-            joints2d=to_camera.points(reading.uv),
-            joints3d=reading.joints,
-            covariance2d=to_camera.covariances(reading.uv_covs),
-            covariance3d=reading.covs,
+            joints2d=to_camera.points(poses.uv),
+            joints3d=poses.joints,
+            covariance2d=to_camera.covariances(poses.uv_covs),
+            covariance3d=poses.covs,
             observed=found.measured.mask,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
             effective_sample_size=torch.stack(
@@ -144,37 +148,40 @@ class PoseReader(NamedTuple):
             frame=self.frame,
             notes=(*notes, *mending_notes(left, right)),
             method=self.method,
-            inlier_probability=found.probability.to(reading.uv),
+            inlier_probability=found.probability.to(poses.uv),
             **_bone_fields(estimates.bones),
         )
 
     def _placed(
-        self, reading: ReadOut, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
-    ) -> ReadOut:
+        self, poses: CameraPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
+    ) -> CameraPoses:
         """Return the poses with calibrated covariances, in the frame that was asked for."""
         if self.estimator.reads_rays:
-            reading = on_their_rays(reading, matrix, self.order, observed)
+            poses = on_their_rays(poses, matrix, observed)
         if self.calibrated:
             mode = self.estimator.calibration or calibration_mode(self.method)
-            reading = reading._replace(covs=recalibrated(reading.covs, self.prior.noise, mode))
+            poses = poses._replace(covs=recalibrated(poses.covs, self.prior.noise, mode))
         if self.frame == "body":
-            return reading
-        fixed = self.prior.left.moments()[0][18:] if self.static_camera else None
-        return in_camera_axes(reading, self.order, fixed)
+            return in_body_axes(poses)
+        return put_at(poses, self.prior.left.moments()[0][18:]) if self.static_camera else poses
 
-    def _tilted(self, reading: ReadOut, matrix: Float[Tensor, "3 3"]) -> ReadOut:
+    def _tilted(self, poses: CameraPoses, matrix: Float[Tensor, "3 3"]) -> CameraPoses:
         """Return poses of the level camera in the pixels and the axes of the camera that is tilted."""
         turn = kept_turn(self.camera, self.prior)
         if turn is None:
-            return reading
+            return poses
         back = turn.back(matrix.to(turn.rotation))
-        uv_covs = back.covariances(reading.uv_covs, reading.uv)
-        reading = reading._replace(uv=back.points(reading.uv), uv_covs=uv_covs)
+        uv_covs = back.covariances(poses.uv_covs, poses.uv)
+        poses = poses._replace(uv=back.points(poses.uv), uv_covs=uv_covs)
         if self.frame == "body":
-            return reading
-        rotation = back.rotation.to(reading.joints)
-        covs = rotation @ reading.covs @ rotation.mT
-        return reading._replace(joints=reading.joints @ rotation.mT, covs=covs)
+            return poses
+        rotation = back.rotation.to(poses.joints)
+        return poses._replace(
+            joints=poses.joints @ rotation.mT,
+            covs=rotation @ poses.covs @ rotation.mT,
+            rotations=rotation @ poses.rotations,
+            place=poses.place @ rotation.mT,
+        )
 
 
 def _bone_fields(bones: Bones | None) -> dict[str, Any]:

@@ -74,16 +74,21 @@ class ScreenModel(NamedTuple):
         dt: seconds between two frames. scale: pixels per metre of the prior's mean pose.
         low, high: corners of the region outside of which every pixel is an outlier [2].
         broad: the variance of a joint that may be anywhere in the image.
-        start: log (1 - o) / (o u 2 pi), o the share of outliers and u their density.
+        start: log (1 - o) (1 - b) / (o u 2 pi) and log (1 - o) b / (o u 2 pi), o the share of outliers, u
+            their density and b the share of brisk frames [2].
         moving: the linear map of (var x, cov x v, var v) over one frame [3, 3].
         drift, kept: the seconds for which a velocity moves a joint, and the share of it that is left.
         agitation: the process noise of these moments, at 1 pixel per metre [8, 3].
-        jump: the further variance of the place of a brisk joint [8]. speed: the variance of a velocity [8].
+        jump: the further variance of the place of a brisk joint [8]. lurch: its further (var x, cov x v,
+            var v) over that one [3]. speed: the variance of a velocity [8].
         log_scales: the logs of the person's scales over `scale` [G]. usual: their prior log-probability [G].
         memory: the share of their log-weights that a frame keeps.
-        below, spread: the place of each joint below the neck at each scale, pixels, and its variance [G, 8].
-        subsets: all subsets of the joints that are present [S, 8].
-        exchanges: for each way to exchange left and right, the joints to take [X, 8].
+        below, spread: the place of each joint from the neck at each scale, pixels [G, 8, 2], and its variance
+            [G, 8].
+        subsets: all subsets of the joints that are present [S, 8]. with_without: the same, and then which
+            joints are not in them [S, 16].
+        exchanges: for each way to exchange left and right, the joints to take [X, 8]. exchanged: which
+            joints these are another one for [X, 8].
         switching: the log-probability of each way after each other one [X, X].
     """
 
@@ -92,12 +97,13 @@ class ScreenModel(NamedTuple):
     low: Tensor
     high: Tensor
     broad: float
-    start: float
+    start: Tensor
     moving: Tensor
     drift: float
     kept: float
     agitation: Tensor
     jump: Tensor
+    lurch: Tensor
     speed: Tensor
     log_scales: Tensor
     usual: Tensor
@@ -105,7 +111,9 @@ class ScreenModel(NamedTuple):
     below: Tensor
     spread: Tensor
     subsets: Tensor
+    with_without: Tensor
     exchanges: Tensor
+    exchanged: Tensor
     switching: Tensor
 
 
@@ -163,15 +171,17 @@ def screen_model(
     below, spread, speed, brisk = like.new_tensor([_KINDS[_kind(name)] for name in UPPER_BODY]).mT
     log_scales = like.new_tensor(_SCALES).log()
     sizes = scale * log_scales.exp()[:, None]
-    exchanges = _exchanges(joints)
+    places = torch.stack([torch.zeros_like(sizes * below), sizes * below], -1)
+    subsets, exchanges = _subsets(joints).to(like), like.new_tensor(_exchanges(joints)).long()
+    start = like.new_tensor([1 - BRISK, BRISK]).log() - outlier - math.log(2 * math.pi)
     return ScreenModel(
         dt, scale, middle - _ENLARGED / 2 * size, middle + _ENLARGED / 2 * size,
-        float(size.amax() / 2) ** 2, -outlier - math.log(2 * math.pi),
+        float(size.amax() / 2) ** 2, start,
         like.new_tensor(moving), drift, kept, speed.square()[:, None] * grown,
-        (brisk * dt).square(), speed.square(), log_scales,
+        (brisk * dt).square(), like.new_tensor([1.0, 1 / dt, 1 / dt**2]), speed.square(), log_scales,
         (-(log_scales / _SCALE_SPREAD).square() / 2).log_softmax(0),
-        math.exp(-dt / _SCALE_MEMORY), sizes * below, (sizes * spread).square(),
-        _subsets(joints).to(like), torch.tensor(exchanges, device=like.device),
+        math.exp(-dt / _SCALE_MEMORY), places, (sizes * spread).square(), subsets,
+        torch.cat([subsets, 1 - subsets], 1), exchanges, exchanges != exchanges[0],
         _switching(len(exchanges)).to(like),
     )  # fmt: skip
 

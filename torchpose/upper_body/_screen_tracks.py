@@ -52,9 +52,9 @@ def predict_tracks(
     model: ScreenModel, state: ScreenState, square: Float[Tensor, "B 1 1"]
 ) -> ScreenState:
     """Return the state a frame later: velocities persist for a while, and spreads grow."""
-    cov = state.cov @ model.moving + square[..., None] * model.agitation
+    cov = torch.addcmul(state.cov @ model.moving, square[..., None], model.agitation)
     return state._replace(
-        position=state.position + model.drift * state.velocity,
+        position=state.position.add(state.velocity, alpha=model.drift),
         velocity=model.kept * state.velocity,
         cov=cov * (model.broad / cov[..., :1]).clamp_max(1.0),
     )
@@ -65,47 +65,44 @@ def take_over(
 ) -> tuple[ScreenState, Float[Tensor, "B 2 8"]]:
     """Return the state in which candidates with more evidence have become the tracks, and the log-odds.
 
+    Those of the tracks count what the other joints say (`body`), those of candidates not.
+
     Evidence is the time for which a track was seen, up to `TAKEOVER`. A place that does not go with the
     other joints needs more of it, and may need more than there can be.
     """
-    alive = state.evidence[:, 1] > 0
-    odds = torch.stack([odds[:, 0], odds[:, 1].where(alive, -math.inf)], 1)
-    right = odds[:, 0] + body > 0
-    again = ~right & (odds[:, 1] > 0)
-    change = torch.where(again, model.dt, torch.where(right, -TAKEOVER, -model.dt))
-    evidence = torch.stack([
-        (state.evidence[:, 0] + model.dt * (right & known)).clamp_max(TAKEOVER),
-        (state.evidence[:, 1] + change * known).clamp(0.0, 2 * TAKEOVER),
-    ], 1)  # fmt: skip
-    doubt = -(body + DOUBTFUL).clamp_max(0.0) / (CERTAIN - DOUBTFUL)
-    needed = evidence[:, 0] + TAKEOVER * doubt
-    taken = known & again & (evidence[:, 1] > needed)
-    state = state._replace(evidence=evidence)
-    if not bool(taken.any()):
-        return state, odds
-    order = torch.stack([taken, ~taken], 1).long()
-    tracks = {name: in_order(getattr(state, name), order, 1) for name in TRACKS}
-    return state._replace(**tracks), in_order(odds, order, 1)
+    (track, candidate), (of_track, of_candidate) = odds.unbind(1), state.evidence.unbind(1)
+    candidate = candidate.masked_fill(of_candidate <= 0, -math.inf)
+    right, beside = track + body > 0, candidate > 0
+    change = torch.where(right, -TAKEOVER, torch.where(beside, model.dt, -model.dt))
+    of_track = (of_track + model.dt * (right & known)).clamp_max(TAKEOVER)
+    of_candidate = (of_candidate + change * known).clamp(0.0, 2 * TAKEOVER)
+    needed = of_track - TAKEOVER / (CERTAIN - DOUBTFUL) * (body + DOUBTFUL).clamp_max(0.0)
+    taken = known & ~right & beside & (of_candidate > needed)
+    state = state._replace(evidence=torch.stack([of_track, of_candidate], 1))
+    odds = torch.stack([track, candidate], 1)
+    if bool(taken.any()):
+        order = torch.stack([taken, ~taken], 1).long()
+        tracks = {name: in_order(getattr(state, name), order, 1) for name in TRACKS}
+        state, odds = state._replace(**tracks), in_order(odds, order, 1)
+    track, candidate = odds.unbind(1)
+    return state, torch.stack([track + body, candidate], 1)
 
 
 def update_tracks(
     state: ScreenState, z: Tensor, noise: Tensor, weight: Float[Tensor, "B 2 8"]
 ) -> ScreenState:
     """Return both tracks after a pixel that is theirs with a probability: the moments of the mixture."""
-    pp, pv, vv = state.cov.unbind(-1)
-    total = pp + noise[:, None]
-    gain, turn = pp / total, pv / total
+    total = state.cov[..., 0] + noise[:, None]
+    gains = state.cov[..., :2] / total[..., None]
+    gain, turn = gains.unbind(-1)
     apart = z[:, None] - state.position
-    spread = weight * (1 - weight) * apart.square().sum(-1) / 2
-    cov = [
-        pp - weight * gain * pp + spread * gain.square(),
-        pv - weight * gain * pv + spread * gain * turn,
-        vv - weight * turn * pv + spread * turn.square(),
-    ]
+    change = weight * ((1 - weight) * apart.square().sum(-1) / 2 - total)
+    squares = torch.stack([gain.square(), gain * turn, turn.square()], -1)
+    forward, faster = (weight[..., None] * gains).split(1, -1)
     return state._replace(
-        position=state.position + (weight * gain)[..., None] * apart,
-        velocity=state.velocity + (weight * turn)[..., None] * apart,
-        cov=torch.stack(cov, -1),
+        position=torch.addcmul(state.position, forward, apart),
+        velocity=torch.addcmul(state.velocity, faster, apart),
+        cov=torch.addcmul(state.cov, change[..., None], squares),
     )
 
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import linear
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._screen_model import (
     APART,
-    BRISK,
     OUTLIERS,
     SLACK,
     TAKEOVER,
@@ -132,29 +132,23 @@ def _step(
     square = scale.square()[:, None, None]
     state = predict_tracks(model, state, square)
     noise, jump = noise + SLACK**2 * square, square * model.jump
+    odds = _log_odds(model, state, uv, known, noise, doubt, jump[:, None])
     if len(model.exchanges) > 1:
-        track = state.position[:, :1], state.cov[:, :1]
-        odds = _log_odds(model, *track, uv, known, noise, doubt, jump)
         hands = state.position[:, 0, _LEFT] - state.position[:, 0, _RIGHT]
-        state, way = _exchange(model, state, odds, hands.norm(dim=-1) > APART * scale)
+        state, odds, way = _exchange(model, state, odds, hands.norm(dim=-1) > APART * scale)
     else:
-        way = torch.zeros(len(uv), dtype=torch.long, device=uv.device)
+        odds, way = _Odds(*(x[:, :, 0] for x in odds)), torch.zeros_like(known[:, 0, 0].long())
     rows = torch.arange(len(way), device=way.device)
-    z, known, noise, doubt = (x[rows, way] for x in (uv, known, noise, doubt))
-    both = _log_odds(
-        model, state.position, state.cov, z[:, None], known[:, None], noise[:, None],
-        doubt[:, None], jump,
-    )  # fmt: skip
-    change = both.brisk * jump
-    changed = torch.stack([change, change / model.dt, change / model.dt**2], -1)
-    body, scales = _beside_others(model, both.total[:, 0], z, known, noise, state.scales)
-    state = state._replace(cov=state.cov + changed, scales=scales)
-    state, total = take_over(model, state, both.total, body, known)
-    odds_now = torch.stack([total[:, 0] + body, total[:, 1]], 1)
-    probability = odds_now.sigmoid() * known[:, None]
-    nowhere = (probability < 0.5) & (body < -DOUBTFUL)[:, None]
-    state = update_tracks(state, z, noise, torch.where(nowhere, 0.0, probability))
-    new = known & (probability < 0.5).all(1) & (state.evidence[:, 1] <= 0)
+    z, known, noise = (x[rows, way] for x in (uv, known, noise))
+    body, scales = _beside_others(model, odds.total[:, 0], z, known, noise, state.scales)
+    change = (odds.brisk * jump)[..., None] * model.lurch
+    state = state._replace(cov=state.cov + change, scales=scales)
+    state, total = take_over(model, state, odds.total, body, known)
+    probability = total.sigmoid() * known[:, None]
+    wrong = probability < 0.5
+    nowhere = wrong & (body < -DOUBTFUL)[:, None]
+    state = update_tracks(state, z, noise, probability.masked_fill(nowhere, 0.0))
+    new = known & wrong.all(1) & (state.evidence[:, 1] <= 0)
     if bool(new.any()):
         state = start_candidates(model, state, z, noise, square[:, 0], new)
     return state, probability[:, 0], way
@@ -162,46 +156,50 @@ def _step(
 
 def _log_odds(
     model: ScreenModel,
-    position: Float[Tensor, "B #N 8 2"],
-    cov: Float[Tensor, "B #N 8 3"],
-    uv: Float[Tensor, "B #N 8 2"],
-    known: Bool[Tensor, "B #N 8"],
-    noise: Float[Tensor, "B #N 8"],
-    doubt: Float[Tensor, "B #N 8"],
-    jump: Float[Tensor, "B 1 8"],
+    state: ScreenState,
+    uv: Float[Tensor, "B X 8 2"],
+    known: Bool[Tensor, "B X 8"],
+    noise: Float[Tensor, "B X 8"],
+    doubt: Float[Tensor, "B X 8"],
+    jump: Float[Tensor, "B 1 1 8"],
 ) -> _Odds:
-    """Return log ((1 - o) f(z) / (o u)), 0 where nothing is measured; see `advance_screen`."""
-    start = model.start - doubt
-    half, calm = (uv - position).square().sum(-1) / 2, cov[..., 0] + noise
-    brisk = calm + jump
-    usual = start + math.log1p(-BRISK) - calm.log() - half / calm
-    other = start + math.log(BRISK) - brisk.log() - half / brisk
-    total = torch.logaddexp(usual, other)
-    return _Odds(total * known, (other - total).exp() * (known & (total > 0)))
+    """Return log ((1 - o) f(z) / (o u)) of tracks and candidates for each way of exchange, [B, 2, X, 8].
+
+    It is 0 where nothing is measured; see `advance_screen`.
+    """
+    half = (uv[:, None] - state.position[:, :, None]).square().sum(-1) / 2
+    calm = state.cov[:, :, None, :, 0] + noise[:, None]
+    variance = torch.stack([calm, calm + jump], -1)
+    densities = model.start - variance.log() - half[..., None] / variance
+    usual, brisk = (densities - doubt[:, None, ..., None]).unbind(-1)
+    total, known = torch.logaddexp(usual, brisk), known[:, None]
+    return _Odds(total * known, (brisk - total).exp() * (known & (total > 0)))
 
 
 def _exchange(
     model: ScreenModel, state: ScreenState, odds: _Odds, apart: Bool[Tensor, " B"]
-) -> tuple[ScreenState, Int[Tensor, " B"]]:
-    """Return the most probable way to exchange left and right, and the state that knows it.
+) -> tuple[ScreenState, _Odds, Int[Tensor, " B"]]:
+    """Return the state that knows the most probable way to exchange left and right, its odds, and the way.
 
     It begins only where it puts both hands well on their tracks and these are apart: hands that meet may
     part in two ways. One that lasts is no exchange: the tracks are, and take the other side's place.
     """
-    ways = model.exchanges
-    fits = torch.nn.functional.softplus(odds.total).sum(-1)
-    well = (odds.total > 0) & (odds.brisk < 0.5)
-    clear = (well | (ways == ways[0])).all(-1) & apart[:, None]
-    clear = clear | (state.lasting > 0)[:, None]
-    clear[:, 0] = True
+    ways, track = model.exchanges, odds.total[:, 0]
+    fits = torch.nn.functional.softplus(track).sum(-1)
+    ill = model.exchanged & ((track <= 0) | (odds.brisk[:, 0] >= 0.5))
+    barred = (
+        (ill.any(-1) | ~apart[:, None]) & (state.lasting <= 0)[:, None] & model.exchanged.any(1)
+    )
     log_weights = (state.exchange[:, :, None] + model.switching).logsumexp(1)
-    log_weights = (log_weights + fits).masked_fill(~clear, -math.inf).log_softmax(-1)
+    log_weights = (log_weights + fits).masked_fill(barred, -math.inf).log_softmax(-1)
     way = torch.where(log_weights[:, 0] < math.log(0.5), log_weights[:, 1:].argmax(-1) + 1, 0)
     lasting = torch.where(way > 0, state.lasting + model.dt, 0.0)
     turned = lasting > TAKEOVER
     state = state._replace(exchange=log_weights, lasting=lasting)
+    rows = torch.arange(len(way), device=way.device)
+    odds = _Odds(*(x[rows, :, way] for x in odds))
     if not bool(turned.any()):
-        return state, way
+        return state, odds, way
     order = ways[torch.where(turned, way, 0)][:, None]
     none = torch.full_like(log_weights, -math.inf)
     none[:, 0] = 0.0
@@ -210,7 +208,8 @@ def _exchange(
         exchange=torch.where(turned[:, None], none, log_weights),
         lasting=torch.where(turned, 0.0, lasting),
     )
-    return state, torch.where(turned, 0, way)
+    odds = _Odds(*(in_order(x, order, 2) for x in odds))
+    return state, odds, torch.where(turned, 0, way)
 
 
 def _beside_others(
@@ -228,23 +227,21 @@ def _beside_others(
     first result is the log of phi with the joint over phi without it, averaged over subsets and scales.
     """
     odds = odds.clamp(-_MOST, _MOST)
-    precision = known[:, None] / (model.spread + noise[:, None])  # [B, G, 8]
-    u, v = (z - z.mean(1, keepdim=True))[:, None].unbind(-1)
-    v = v - model.below
-    sums = [precision, precision * u, precision * v, precision * (u.square() + v.square())]
-    total, first, second, square = (torch.stack(sums, 1) @ model.subsets.mT).unbind(1)
-    best = (first.square() + second.square()) / total.clamp_min(1e-12)
-    count = (known.to(z) @ model.subsets.mT - 1).clamp_min(0.0)[:, None]
-    weights = (best - square) / 2 - 2 * count * model.log_scales[:, None]
-    weights = scales[..., None] + weights + (odds @ model.subsets.mT)[:, None]
-    of_scales = weights.logsumexp(-1)
-    share = (weights - of_scales.amax(1)[:, None, None]).exp().sum(1)
-    inside, outside = share @ model.subsets, share @ (1 - model.subsets)
+    precision = (known[:, None] / (model.spread + noise[:, None]))[..., None]  # [B, G, 8, 1]
+    apart = (z - z.mean(1, keepdim=True))[:, None] - model.below
+    pulled = precision * apart
+    sums = model.subsets @ torch.cat([precision, pulled, pulled * apart], -1)  # [B, G, S, 5]
+    total, pull, square = sums.split([1, 2, 2], -1)
+    misfit = (square - pull.square() / total.clamp_min(1e-12)).sum(-1)
+    count = (linear(known.to(z), model.subsets) - 1).clamp_min(0.0)
+    weights = linear(odds, model.subsets)[:, None] - 2 * count[:, None] * model.log_scales[:, None]
+    weights = scales[..., None] + weights - misfit / 2
+    of_scales = weights.logsumexp(-1, keepdim=True)
+    share = (weights - of_scales.amax(1, keepdim=True)).exp().sum(1)
     tiny = torch.finfo(share.dtype).tiny
-    body = inside.clamp_min(tiny).log() - outside.clamp_min(tiny).log() - odds
-    body = torch.where(known, body, 0.0).clamp_max(0.0)
-    seen = model.memory * of_scales + (1 - model.memory) * model.usual
-    return body, seen.log_softmax(-1)
+    inside, outside = (share @ model.with_without).clamp_min(tiny).log().split(8, -1)
+    body = (inside - outside - odds).clamp_max(0.0) * known
+    return body, model.usual.lerp(of_scales[..., 0], model.memory).log_softmax(-1)
 
 
 def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"]:
@@ -260,7 +257,7 @@ def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"]:
 
 def _largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
     """Return the larger eigenvalue of each covariance."""
-    (a, b), (c, d) = (row.unbind(-1) for row in cov.unbind(-2))
+    a, b, c, d = cov.flatten(-2).unbind(-1)
     return (a + d) / 2 + (((a - d) / 2).square() + b * c).clamp_min(0.0).sqrt()
 
 

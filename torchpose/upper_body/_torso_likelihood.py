@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Shaped
@@ -35,16 +35,39 @@ class TorsoLengths(NamedTuple):
     """Lengths of a torso, metres.
 
     Attributes:
-        width: the distance between the shoulders, [B]. height: the height of the head above the neck, [B].
-        width_std, height_std: their standard deviations, [B].
-        neck: the height of the neck above the middle of the shoulders.
+        width: the distance between the shoulders, [B].
+        spine: neck and head relative to the middle of the shoulders, camera axes, upright above it,
+            [B, 2, 3].
+        stiffness: the variance of shoulders, neck and head about their places in x and y, metres squared,
+            arms hanging, [B, 4, 2].
     """
 
     width: Tensor
-    height: Tensor
-    width_std: Tensor
-    height_std: Tensor
-    neck: float = NECK_HEIGHT
+    spine: Tensor
+    stiffness: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        width: Float[Tensor, " B"],
+        height: Float[Tensor, " B"],
+        width_std: Float[Tensor, " B"],
+        height_std: Float[Tensor, " B"],
+        neck: float = NECK_HEIGHT,
+    ) -> Self:
+        """Return the lengths of a torso.
+
+        Args:
+            width: the distance between the shoulders. height: the height of the head above the neck.
+            width_std, height_std: their standard deviations.
+            neck: the height of the neck above the middle of the shoulders.
+        """
+        up = torch.stack([torch.full_like(height, -neck), -neck - height], 1)
+        level, zero = torch.zeros_like(up), torch.zeros_like(height)
+        across = width_std / 2
+        spread = torch.stack([across, zero, across, zero, zero, zero, zero, height_std], -1)
+        stiffness = spread.square().unflatten(-1, (4, 2)) + _stiff(height.dtype, height.device)
+        return cls(width, torch.stack([level, up, level], -1), stiffness)
 
 
 class Root(NamedTuple):
@@ -122,16 +145,8 @@ def torso_places(
         lengths: the lengths of the torso.
     """
     shoulders = shoulder_offsets(turn, half)
-    spine = with_axes(spine_places(lengths), turn.ndim - 1).expand_as(shoulders)
+    spine = with_axes(lengths.spine, turn.ndim - 1).expand_as(shoulders)
     return torch.cat([shoulders, spine], -2)
-
-
-def spine_places(lengths: TorsoLengths) -> Float[Tensor, "B 2 3"]:
-    """Return neck and head relative to the middle of the shoulders, camera axes: upright above it."""
-    neck = torch.full_like(lengths.height, -lengths.neck)
-    up = torch.stack([neck, neck - lengths.height], 1)
-    level = torch.zeros_like(up)
-    return torch.stack([level, up, level], -1)
 
 
 def middle_of_shoulders(torso: Torso, root: Root, lengths: TorsoLengths) -> Float[Tensor, "B M 3"]:
@@ -174,7 +189,7 @@ def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -
     Without shoulders it is told by neck and head alone, for which the turn does not matter.
     """
     rays, known, std = (with_axes(x, depth.ndim - 1) for x in torso[:3])
-    stiff = with_axes(_stiffness(lengths), depth.ndim - 1)
+    stiff = with_axes(lengths.stiffness, depth.ndim - 1)
     if torso.sided:
         raised = torso.raised(depth)
         place = torso_places(turn, half_widths(lengths.width, raised), lengths)
@@ -188,19 +203,11 @@ def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -
         )
     else:
         rays, known, std, stiff = rays[..., 2:, :], known[..., 2:], std[..., 2:], stiff[..., 2:, :]
-        place, away = with_axes(spine_places(lengths), depth.ndim - 1), depth[..., None]
+        place, away = with_axes(lengths.spine, depth.ndim - 1), depth[..., None]
     value = rays[..., :2] * away[..., None] - place[..., :2]
     precision = known[..., None].to(depth) / (stiff + (std * away).square()[..., None])
     mean = (precision * value).sum(-2) / precision.sum(-2).clamp_min(1e-12)
     return _Middle(value, precision, mean)
-
-
-def _stiffness(lengths: TorsoLengths) -> Float[Tensor, "B 4 2"]:
-    """Return the variance of each torso joint about its place in x and y, metres squared, arms hanging."""
-    across, up = lengths.width_std / 2, lengths.height_std
-    zero = torch.zeros_like(up)
-    spread = torch.stack([across, zero, across, zero, zero, zero, zero, up], -1)
-    return spread.square().unflatten(-1, (4, 2)) + _stiff(up.dtype, up.device)
 
 
 @cache

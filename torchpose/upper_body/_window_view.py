@@ -8,11 +8,11 @@ from torch import Tensor
 
 from torchpose._core.module_state import derived
 from torchpose.camera._virtual_camera import (
+    ANCHORS,
     BodyView,
     PathModel,
     Regression,
     body_path,
-    log_magnification,
     path_regression,
     to_view,
     view_body,
@@ -23,8 +23,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator import ARMS
 from torchpose.upper_body._measured_joints import MeasuredJoints, pixels_per_metre
 
-_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
-_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
+_HANDS = slice(0, len(UPPER_BODY), len(UPPER_BODY) - 1)  # the first and the last joint
 
 
 class SeenInView(NamedTuple):
@@ -95,20 +94,18 @@ def see_in_view(
         uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise, regression
     )
     neck, height = path.at(0)
-    apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
-    reach = torch.where(mask[:, start:, _HANDS], apart, 0.0).amax(-1)
+    carried, known = window_measurements(uv, mask, layout, tuple(ARMS), path, start)
+    uv, mask = uv[:, start:], mask[:, start:]
+    apart = torch.linalg.vector_norm(uv[:, :, _HANDS] - neck[:, :, None], dim=-1)
+    reach = torch.where(mask[:, :, _HANDS], apart, 0.0).amax(-1)
     view = view_body(neck, height, model, matrix, reach)
-    windows = {side: window_measurements(uv, mask, layout, side, path, start) for side in ARMS}
-    places = torch.cat([uv[:, start:], *(values for values, _ in windows.values())], 2)
-    now, *of_arms = to_view(places, view, matrix).split([uv.shape[2], *[layout.n_hands] * 2], 2)
-    hands = {
-        side: (values.flatten(-2), known.repeat_interleave(2, -1))
-        for values, (side, (_, known)) in zip(of_arms, windows.items(), strict=True)
-    }
-    now = torch.where(mask[:, start:, :, None], now, 0.0)
+    seen, log_scale = to_view(torch.cat([uv, carried], 2), view, matrix)
+    now, hands = seen.split([uv.shape[2], carried.shape[2]], 2)
+    of_arms = hands.flatten(2).chunk(2, 2), known.repeat_interleave(2, 2).chunk(2, 2)
+    windows = dict(zip(ARMS, zip(*of_arms, strict=True), strict=True))
+    now = torch.where(mask[..., None], now, 0.0)
     cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
-    log_scale = log_magnification(now, view, matrix)
-    return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
+    return SeenInView(MeasuredJoints(now, mask, cov), windows, view, log_scale[..., : uv.shape[2]])
 
 
 def _kept_path(
@@ -134,4 +131,4 @@ def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) ->
 
 def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
     """Return the variance of a coordinate of head and neck, pixels squared."""
-    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)
+    return cov[..., ANCHORS, :, :].diagonal(dim1=-2, dim2=-1).mean(-1)

@@ -11,14 +11,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.module_state import derived, outside_inference
+from torchpose._core.module_state import derived, index_tensor, outside_inference
 from torchpose.camera._virtual_camera import memory_frames, planes_in_view
 from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
-from torchpose.filters._measurements import Measurements
+from torchpose.filters._measurements import Measurements, check_lengths
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
+from torchpose.math._geometric_median import median_columns
 from torchpose.math._rotations import matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -165,16 +166,19 @@ class WindowMixture(Estimator):
         absence: Absence | None = None,
     ) -> Estimates:
         """Return the estimates of frames; their evidence is that of each frame given its window."""
-        arms = {}
-        for side, arm in ARMS.items():
+        (batch, n_frames), device = seen.measured.uv.shape[:2], seen.measured.uv.device
+        lengths, arms, contexts = check_lengths(lengths, batch, n_frames, device), [], []
+        for side in ARMS:
             measured = _limbs_last(joints[side])
             model = self._filter(side, measured)
-            frames = model.check(*self._given(seen, side, measured), lengths, None)
+            frames = self._frames(model, seen, side, measured, lengths)
             point = None if absence is None else self._outside(seen, absence, side)
             out, context = self._filtered(model, frames, measured, point, progress)
-            told = arm[:_N_LIMB] if self.of_limbs else arm
-            arms[side] = _pose_of_window(in_double(out), context, seen, told)
-        return Estimates(arms["left"], arms["right"], seen.view)
+            arms.append(in_double(out))
+            contexts.append(context)
+        told = tuple(arm[:_N_LIMB] if self.of_limbs else arm for arm in ARMS.values())
+        left, right = _beyond_context(arms, contexts, seen, told)
+        return Estimates(left, right, seen.view)
 
     def _filtered(
         self,
@@ -195,12 +199,11 @@ class WindowMixture(Estimator):
         wanted = Wanted((*range(STATE_DIM), *self.layout.in_torso), self._context(joints))
         rule, given, medians = model.weight_rule, (frames, True), model.medians
         if point is None:
-            if len(medians):
-                medians = _limbs_in_torso(medians.device)
-            out, context = run_with_context(model, rule, medians, *given, wanted, progress)
+            columns = _limbs_in_torso(medians.device)[: len(medians)]
+            out, context = run_with_context(model, rule, columns, *given, wanted, progress)
         else:
-            whole = wanted._replace(columns=None)
-            out, context = run_with_context(model, rule, medians, *given, whole, progress)
+            whole, columns = wanted._replace(columns=None), median_columns(medians)
+            out, context = run_with_context(model, rule, columns, *given, whole, progress)
             out = with_outside_point(model, out, frames, point)
             kept = torch.tensor(wanted.columns, device=medians.device)
             cov = require_cov(out)[..., kept[:, None], kept]
@@ -222,22 +225,27 @@ class WindowMixture(Estimator):
         planes = planes_in_view(absence.planes, seen.view, matrix)
         return OutsidePoint(torch.arange(2, device=planes.device), planes, log_inside)
 
-    def _given(
-        self, seen: SeenInView, side: str, joints: tuple[str, ...]
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return values, mask and R of the hands of the window and of some joints of an arm."""
+    def _frames(
+        self,
+        model: FixedTrackFilter,
+        seen: SeenInView,
+        side: str,
+        joints: tuple[str, ...],
+        lengths: Int[Tensor, " B"],
+    ) -> Measurements:
+        """Return the hands of the window and some joints of an arm, which were checked as keypoints."""
         cov = self.model.measurement_cov
         noise = _window_noise(seen, self.window, side, joints, cov) if joints else None
-        values, mask = _window_inputs(seen, side, joints)
-        if not self.model.upright:
-            return values, mask, noise
-        # roll and pitch of the virtual camera are known, and bodies of the prior are upright
-        angles = matrix_to_euler(seen.view.rotation, "zxy")[..., :2]
-        known = torch.ones_like(mask[..., :2])
-        if noise is not None:
-            spread = upright_cov().to(noise)
-            noise = _blocks(spread.expand(*noise.shape[:-2], 2, 2), noise)
-        return torch.cat([angles, values], -1), torch.cat([known, mask], -1), noise
+        z, mask = _window_inputs(seen, side, joints)
+        if self.model.upright:
+            # roll and pitch of the virtual camera are known, and bodies of the prior are upright
+            angles = matrix_to_euler(seen.view.rotation, "zxy")[..., :2]
+            z, mask = torch.cat([angles, z], -1), torch.nn.functional.pad(mask, (2, 0), value=True)
+            if noise is not None:
+                spread = upright_cov().to(noise)
+                noise = _blocks(spread.expand(*noise.shape[:-2], 2, 2), noise)
+        z = torch.where(mask, z, 0.0).to(model.dtype)
+        return Measurements(z, mask, model.own_noise() if noise is None else noise, lengths)
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> FixedTrackFilter:
         """Return the filter of an arm; made once for its prior, noise and settings."""
@@ -290,7 +298,7 @@ def _window_filter(
     layout = window.layout
     blocks = [upright_cov().to(measurement_cov)] if upright else []
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
-    blocks += [*measurement_cov[_rows(side, joints)]]
+    blocks += [*measurement_cov[list(_rows(side, joints))]]
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
     return FixedTrackFilter(
         getattr(window, side),
@@ -316,11 +324,11 @@ def _window_inputs(
     seen: SeenInView, side: str, joints: tuple[str, ...]
 ) -> tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]]:
     """Return values and mask of the hands of the window, and of some joints of an arm."""
-    rows = _rows(side, joints)
+    rows = index_tensor(_rows(side, joints), seen.measured.uv.device)
     hands, known = seen.hands[side]
-    z, mask = seen.measured.uv[:, :, rows], seen.measured.mask[:, :, rows]
-    mask = mask[..., None].expand(z.shape).flatten(-2)
-    return torch.cat([hands, z.flatten(-2)], -1), torch.cat([known, mask], -1)
+    z = seen.measured.uv.index_select(2, rows).flatten(-2)
+    mask = seen.measured.mask.index_select(2, rows).repeat_interleave(2, -1)
+    return torch.cat([hands, z], -1), torch.cat([known, mask], -1)
 
 
 def _window_noise(
@@ -333,7 +341,8 @@ def _window_noise(
     """Return R of `_window_inputs`; None where it is that of the filter."""
     if seen.measured.cov is measurement_cov:
         return None
-    own = seen.measured.cov[..., _rows(side, joints), :, :]
+    rows = index_tensor(_rows(side, joints), seen.measured.cov.device)
+    own = seen.measured.cov.index_select(-3, rows)
     hand = _hand_cov(window, side, measurement_cov)
     hands = hand.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
     return block_diagonal(torch.cat([hands, own], -3))
@@ -353,25 +362,37 @@ def _limbs_last(joints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 @cache
-def _limbs_in_torso(device: torch.device) -> Int[Tensor, " P"]:
-    """Return the first dimensions of hand and elbow in the axes of the torso, after the arm itself."""
+def _limbs_in_torso(device: torch.device) -> Int[Tensor, "P 3"]:
+    """Return the dimensions of hand and elbow in the axes of the torso, after the arm itself."""
     with outside_inference():
-        return STATE_DIM + 3 * torch.arange(_N_LIMB, device=device)
+        return STATE_DIM + torch.arange(3 * _N_LIMB, device=device).view(_N_LIMB, 3)
 
 
-def _rows(side: str, joints: tuple[str, ...]) -> list[int]:
+def _rows(side: str, joints: tuple[str, ...]) -> tuple[int, ...]:
     """Return which of the eight joints these of an arm are."""
-    return [ARMS[side][ARM_JOINTS.index(joint)] for joint in joints]
+    return tuple(ARMS[side][ARM_JOINTS.index(joint)] for joint in joints)
 
 
-def _pose_of_window(
-    out: FilterOutput, context: Float[Tensor, "B T"], seen: SeenInView, arm: tuple[int, ...]
-) -> FilterOutput:
-    """Return an arm's estimate, with its evidence beyond that of the context.
+def _beyond_context(
+    arms: list[FilterOutput],
+    contexts: list[Float[Tensor, "B T"]],
+    seen: SeenInView,
+    told: tuple[tuple[int, ...], ...],
+) -> list[FilterOutput]:
+    """Return the estimates of both arms, with their evidence beyond that of the context.
 
     The evidence is a density over pixels of the prior's camera, not of the virtual one.
+
+    Args:
+        arms, contexts: the estimates, and the log-evidence of the context. seen: what they are told.
+        told: the joints of each arm whose evidence it is.
     """
-    measured = seen.measured.mask[:, :, list(arm)]
-    evidence = out.log_evidence - context
-    evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
-    return out._replace(log_evidence=torch.where(measured.any(-1), evidence, 0.0))
+    rows = index_tensor(sum(told, ()), seen.log_scale.device)
+    known, scale = (
+        values.index_select(2, rows).unflatten(2, (len(told), -1))
+        for values in (seen.measured.mask, seen.log_scale)
+    )
+    evidence = torch.stack([arm.log_evidence for arm in arms], -1) - torch.stack(contexts, -1)
+    evidence = torch.where(known.any(-1), evidence + (scale * known).sum(-1), 0.0)
+    pairs = zip(arms, evidence.unbind(-1), strict=True)
+    return [arm._replace(log_evidence=own) for arm, own in pairs]
