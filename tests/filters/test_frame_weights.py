@@ -10,6 +10,7 @@ from torchpose.errors import InputError
 from torchpose.filters import MixtureKalmanFilter, _memoryless
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.math._gaussian import kalman_gain
+from torchpose.math._geometric_median import median_columns
 from torchpose.priors import GaussianMixture
 
 DIM, OBSERVED, POWER = 4, [0, 2, 3], 0.4
@@ -191,7 +192,8 @@ def test_wanted_dimensions_and_the_context_are_those_of_whole_filters(own_noise)
     noise = own.double() if own_noise else None
     filter_ = make_filter(model, gamma=0.0)
     frames = filter_.check(z, mask, noise, None, None)
-    columns, given = [2, 0], (filter_.weight_rule, filter_.medians, frames, True)
+    medians = median_columns(filter_.medians)
+    columns, given = [2, 0], (filter_.weight_rule, medians, frames, True)
     out, context = run_with_context(filter_, *given, Wanted(tuple(columns), 2))
     whole = filter_(z, mask, noise, return_cov=True)
     torch.testing.assert_close(out.mean, whole.mean[..., columns], rtol=1e-12, atol=1e-12)

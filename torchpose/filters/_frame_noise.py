@@ -101,17 +101,24 @@ def condition_own(
     """
     noise, both = _own_noise(noise, mask)
     factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
-    log_norm = log_normaliser(factor, mask[:, None])
-    own_factor, factor = factor, factor.to(model.dtype)
+    scale = factor.diagonal(dim1=-2, dim2=-1)
+    norms = -0.5 * LOG_2PI * mask[:, None].to(scale) - scale.log()
+    factor = factor.to(model.dtype)
     residual = (z[:, None] - parts.centre.to(model.dtype)) * mask[:, None]
     white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
-    squared = white.square()
-    log_likelihood = log_norm.to(model.dtype) - 0.5 * squared.sum(-1)
+    squares = white.square()
+    log_likelihood = _log_density(norms, squares)
     log_context = None
     if n_context:
-        log_norm = log_normaliser(own_factor, mask[:, None], n_context)
-        log_context = log_norm.to(model.dtype) - 0.5 * squared[..., :n_context].sum(-1)
+        log_context = _log_density(norms[..., :n_context], squares[..., :n_context])
     return OwnFrames(factor, white, log_likelihood, jitter, mask, log_context)
+
+
+def _log_density(
+    norms: Float[Tensor, "N K Z"], squares: Float[Tensor, "N K Z"]
+) -> Float[Tensor, "N K"]:
+    """Return the log-density of whitened innovations, of which the squares and normalisers are given."""
+    return norms.sum(-1).to(squares).sub(squares.sum(-1), alpha=0.5)
 
 
 def log_normaliser(
@@ -156,11 +163,14 @@ def own_moments(
     solved = solved[..., 0]
     gained = (weights[..., None] * solved).flatten(1)
     mean = weights @ centres + gained @ rows.flatten(0, 1)
-    if len(medians):
-        mean = _medians(parts, rows, frames, weights, solved, mean, medians)
-    if not return_cov:
+    if not (return_cov or len(medians)):
         return mean, None
-    return mean, _covariance(parts, rows, frames, weights, solved, mean)
+    # A_j^T S_j^-1 (z - H mu_j) is the move of every mean
+    means = centres + torch.bmm(solved.transpose(0, 1), rows).transpose(0, 1)
+    if len(medians):
+        variances = _variances(parts, rows, frames, medians)
+        mean = with_medians(mean, weights, means[..., medians], variances, medians)
+    return mean, _covariance(parts, rows, frames, weights, means, mean) if return_cov else None
 
 
 def measured_parts(
@@ -185,22 +195,16 @@ def measured_parts(
     return derived(model, ("measured parts", wanted), (model.means, model.covariances), make)
 
 
-def _moved(solved: Float[Tensor, "N K Z"], rows: Float[Tensor, "K Z C"]) -> Float[Tensor, "N K C"]:
-    """Return A_j^T S_j^-1 (z - H mu_j), the move of every mean, in some columns of A."""
-    return torch.bmm(solved.transpose(0, 1), rows).transpose(0, 1)
-
-
 def _covariance(
     parts: MeasuredParts,
     rows: Tensor,
     frames: OwnFrames,
     weights: Tensor,
-    solved: Tensor,
+    means: Float[Tensor, "N K D"],
     mean: Tensor,
 ) -> Float[Tensor, "N D D"]:
     """Return sum_j w_j (Sigma_j + (m_j - m)(m_j - m)^T) - sum_j w_j W_j^T W_j."""
-    apart = parts.means.to(rows) - mean[:, None] + _moved(solved, rows)
-    apart = apart * weights[..., None].sqrt()
+    apart = (means - mean[:, None]) * weights[..., None].sqrt()
     prior = weights @ parts.covs.to(rows).flatten(1)
     explained = _explained(frames.factor, rows, weights, frames.mask)
     return prior.unflatten(-1, rows.shape[-1:] * 2) + apart.mT @ apart - explained
@@ -227,22 +231,12 @@ def _explained(
     return explained[:, :dim, :dim]
 
 
-def _medians(
-    parts: MeasuredParts,
-    rows: Tensor,
-    frames: OwnFrames,
-    weights: Tensor,
-    solved: Tensor,
-    mean: Tensor,
-    medians: Int[Tensor, "P 3"],
-) -> Float[Tensor, "N D"]:
-    """Return the means with geometric medians in these dimensions."""
-    columns = medians.flatten()
-    rows = rows[..., columns]
-    means = parts.means[:, columns].to(rows) + _moved(solved, rows)
-    seen = rows * frames.mask[:, None, :, None]
+def _variances(
+    parts: MeasuredParts, rows: Tensor, frames: OwnFrames, points: Int[Tensor, "P 3"]
+) -> Float[Tensor, "N K P 3"]:
+    """Return the variances of all components in the dimensions of some points."""
+    columns = points.flatten()
+    seen = rows[..., columns] * frames.mask[:, None, :, None]
     white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)
     prior = parts.covs.diagonal(dim1=-2, dim2=-1)[:, columns].to(rows)
-    variances = prior - white.square().sum(-2)
-    means, variances = (x.unflatten(-1, medians.shape) for x in (means, variances))
-    return with_medians(mean, weights, means, variances, medians)
+    return (prior - white.square().sum(-2)).unflatten(-1, points.shape)
