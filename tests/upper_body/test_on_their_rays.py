@@ -2,7 +2,7 @@ import torch
 
 from torchpose.camera import project
 from torchpose.skeleton import UPPER_BODY
-from torchpose.upper_body._estimator import CameraPoses
+from torchpose.upper_body._estimator import SeenPoses
 from torchpose.upper_body._fusion import on_their_rays
 
 K = torch.tensor([[525.0, 0, 320], [0, 525, 240], [0, 0, 1]], dtype=torch.float64)
@@ -19,7 +19,7 @@ def poses(seed=0):
     uv = exact + 20 * torch.randn(2, 3, 8, 2, **kind)
     covs = torch.eye(3, dtype=torch.float64).expand(2, 3, 8, 3, 3)
     shares = torch.ones(2, 3, 1, dtype=torch.float64)
-    return CameraPoses(joints, covs, covs[:, :, :1], shares, place, uv, covs[..., :2, :2]), exact
+    return SeenPoses(joints, covs, covs[:, :, :1], shares, place, uv, covs[..., :2, :2]), exact
 
 
 def seen(joints):

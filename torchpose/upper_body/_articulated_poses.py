@@ -15,7 +15,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import ArmState, mirrored
 from torchpose.upper_body._articulated_frame import HANDS, LIMBS, SHOULDERS
-from torchpose.upper_body._estimator import Bones, CameraPoses, Estimates
+from torchpose.upper_body._estimator import Bones, Estimates, SeenPoses
 
 _NECK = UPPER_BODY.index("neck")
 _STD = 0.03  # metres: of every joint in space
@@ -236,7 +236,7 @@ def estimates_of(
             stacked.log_weights.unbind(2), stacked.log_evidence.unbind(2), strict=True
         )
     )
-    found = CameraPoses(
+    found = SeenPoses(
         stacked.joints, stacked.covs, stacked.rotation[:, :, None], torch.ones_like(neck[..., :1]),
         neck, uv, uv_covs,
     )  # fmt: skip

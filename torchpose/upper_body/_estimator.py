@@ -116,7 +116,7 @@ class ReadOut(NamedTuple):
     uv_covs: Tensor
 
 
-class CameraPoses(NamedTuple):
+class SeenPoses(NamedTuple):
     """Poses in the axes of the camera.
 
     Attributes:
@@ -172,7 +172,7 @@ class Estimates(NamedTuple):
     left: FilterOutput
     right: FilterOutput
     view: BodyView | None = None
-    poses: CameraPoses | None = None
+    poses: SeenPoses | None = None
     bones: Bones | None = None
 
 
@@ -336,9 +336,9 @@ def repeat_last(estimates: Estimates, lengths: Int[Tensor, " B"] | None) -> Esti
     )
 
 
-def repeat_poses(poses: CameraPoses, lengths: Int[Tensor, " B"]) -> CameraPoses:
+def repeat_poses(poses: SeenPoses, lengths: Int[Tensor, " B"]) -> SeenPoses:
     """Return the poses with the last one of each sequence repeated past its length."""
-    return CameraPoses(*_held(poses, lengths))
+    return SeenPoses(*_held(poses, lengths))
 
 
 def _repeat_output(out: FilterOutput, lengths: Int[Tensor, " B"]) -> FilterOutput:

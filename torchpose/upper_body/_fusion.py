@@ -28,10 +28,10 @@ from torchpose.priors._arm_state import STATE_DIM
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import onto_torso
 from torchpose.upper_body._estimator import (
-    CameraPoses,
     Estimates,
     MotionRatios,
     ReadOut,
+    SeenPoses,
     require_cov,
 )
 
@@ -99,8 +99,8 @@ def _on_torso(
 
 
 def on_their_rays(
-    poses: CameraPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
-) -> CameraPoses:
+    poses: SeenPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
+) -> SeenPoses:
     """Return measured limbs on their rays, and the other joints' pixels where they project to.
 
     Pixels and the joints in space are two readings of one mixture, linear each, and differ where a
@@ -131,7 +131,7 @@ def _limb_ends(device: torch.device) -> Bool[Tensor, "8 1"]:
         return torch.tensor(rows, device=device)
 
 
-def in_camera_axes(reading: ReadOut, order: RotationOrder) -> CameraPoses:
+def in_camera_axes(reading: ReadOut, order: RotationOrder) -> SeenPoses:
     """Return poses turned into the camera's axes and put where they are.
 
     Args:
@@ -141,13 +141,13 @@ def in_camera_axes(reading: ReadOut, order: RotationOrder) -> CameraPoses:
     back = rotations.mT
     joints = reading.joints @ back[:, :, 0] + reading.place[:, :, None]
     shares = torch.ones_like(reading.place[..., :1])
-    return CameraPoses(
+    return SeenPoses(
         joints, rotations @ reading.covs @ back, rotations, shares, reading.place, reading.uv,
         reading.uv_covs,
     )  # fmt: skip
 
 
-def in_body_axes(poses: CameraPoses) -> CameraPoses:
+def in_body_axes(poses: SeenPoses) -> SeenPoses:
     """Return joints and covariances turned into the axes of the body, whose centre is their origin."""
     rotation = poses.rotation
     turn = rotation[:, :, None]
@@ -155,7 +155,7 @@ def in_body_axes(poses: CameraPoses) -> CameraPoses:
     return poses._replace(joints=joints, covs=turn.mT @ poses.covs @ turn)
 
 
-def put_at(poses: CameraPoses, place: Float[Tensor, "3"]) -> CameraPoses:
+def put_at(poses: SeenPoses, place: Float[Tensor, "3"]) -> SeenPoses:
     """Return poses whose bodies are all at one place, metres, in camera axes."""
     at = place.to(poses.place)
     joints = poses.joints + (at - poses.place)[:, :, None]

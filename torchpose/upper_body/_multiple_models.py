@@ -18,9 +18,9 @@ from torchpose.upper_body._articulated_frame import ELBOWS, HANDS
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,
-    CameraPoses,
     Estimates,
     Estimator,
+    SeenPoses,
     TrackerModel,
     repeat_last,
 )
@@ -156,7 +156,7 @@ class MultipleModelFilter(Estimator):
         sums = sums + self._later_sums(ratios) - ratios
         return repeat_last(self._mixed(sums, poses, seen, bodies, measured), lengths)
 
-    def _steadied(self, seen: Estimates, lengths: Tensor | None) -> CameraPoses:
+    def _steadied(self, seen: Estimates, lengths: Tensor | None) -> SeenPoses:
         """Return the poses of windows over whole sequences, after their motion stage."""
         reading, stage = read_out(seen, self.matrix, self.order), self._stage
         if stage is not None:
@@ -194,7 +194,7 @@ class MultipleModelFilter(Estimator):
     def _mixed(
         self,
         sums: Float[Tensor, "B T 2"],
-        poses: CameraPoses,
+        poses: SeenPoses,
         seen: Estimates,
         bodies: Estimates,
         measured: MeasuredJoints,
@@ -244,7 +244,7 @@ def _log_ratios(
     return torch.stack([apart, some.to(apart)], -1)
 
 
-def _averaged(share: Float[Tensor, "B T"], ours: CameraPoses, theirs: CameraPoses) -> CameraPoses:
+def _averaged(share: Float[Tensor, "B T"], ours: SeenPoses, theirs: SeenPoses) -> SeenPoses:
     """Return the average of two poses, with the moments of a mixture.
 
     Args:
@@ -257,7 +257,7 @@ def _averaged(share: Float[Tensor, "B T"], ours: CameraPoses, theirs: CameraPose
     joints, covs = _moments(weight, *((poses.joints, poses.covs) for poses in both))
     uv, uv_covs = _moments(weight, *((poses.uv, poses.uv_covs) for poses in both))
     shares = torch.stack([share, 1 - share], -1)
-    return CameraPoses(joints, covs, rotations, shares, place, uv, uv_covs)
+    return SeenPoses(joints, covs, rotations, shares, place, uv, uv_covs)
 
 
 def _moments(

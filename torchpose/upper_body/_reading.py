@@ -13,9 +13,9 @@ from torchpose.math._rotations import RotationOrder
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.upper_body._estimator import (
     Bones,
-    CameraPoses,
     Estimates,
     Estimator,
+    SeenPoses,
     first_failure,
     mending_notes,
     repeat_poses,
@@ -121,7 +121,7 @@ class PoseReader(NamedTuple):
 
     def _track(
         self,
-        poses: CameraPoses,
+        poses: SeenPoses,
         estimates: Estimates,
         found: Screened,
         lengths: Int[Tensor, " B"],
@@ -153,8 +153,8 @@ class PoseReader(NamedTuple):
         )
 
     def _placed(
-        self, poses: CameraPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
-    ) -> CameraPoses:
+        self, poses: SeenPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
+    ) -> SeenPoses:
         """Return the poses with calibrated covariances, in the frame that was asked for."""
         if self.estimator.reads_rays:
             poses = on_their_rays(poses, matrix, observed)
@@ -165,7 +165,7 @@ class PoseReader(NamedTuple):
             return in_body_axes(poses)
         return put_at(poses, self.prior.left.moments()[0][18:]) if self.static_camera else poses
 
-    def _tilted(self, poses: CameraPoses, matrix: Float[Tensor, "3 3"]) -> CameraPoses:
+    def _tilted(self, poses: SeenPoses, matrix: Float[Tensor, "3 3"]) -> SeenPoses:
         """Return poses of the level camera in the pixels and the axes of the camera that is tilted."""
         turn = kept_turn(self.camera, self.prior)
         if turn is None:

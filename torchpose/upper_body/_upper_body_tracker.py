@@ -99,7 +99,7 @@ class UpperBodyTracker(WideModule):
     A frame passes through five stages, each of which takes and returns values: the keypoints become
     `MeasuredJoints` in the prior's pixels, of which `screen_joints` leaves out outliers, an `Estimator`
     turns them into the `Estimates` of both arms, `read_out` joins these into a `ReadOut` of the body, which
-    `MotionStage` steadies, and that becomes `CameraPoses` and a `PoseTrack`. `forward` passes all frames on
+    `MotionStage` steadies, and that becomes `SeenPoses` and a `PoseTrack`. `forward` passes all frames on
     at once, `step` and `advance` some at a time, with the state of each stage.
 
     Args:
