@@ -211,18 +211,9 @@ class ArticulatedFilter(Estimator):
         middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
         lean = root.new_zeros(batch_size, 2)
         waiting = torch.ones(batch_size, dtype=torch.bool, device=root.device)
+        tilt = roll(lean_angle(lean))
         return ArticulatedState(
-            root,
-            None,
-            moments,
-            lengths,
-            sizes,
-            None,
-            middle,
-            lean,
-            roll(lean_angle(lean)),
-            0,
-            waiting,
+            root, None, moments, lengths, sizes, None, middle, lean, tilt, 0, waiting
         )
 
     def advance(
@@ -322,18 +313,9 @@ class ArticulatedFilter(Estimator):
         )  # fmt: skip
         middle = (middle @ tilt.mT)[:, 0]
         after = ArticulatedState(
-            belief,
-            roots,
-            moments,
-            learnt,
-            sizes,
-            posterior,
-            middle,
-            lean,
-            tilt,
-            state.frame + 1,
+            belief, roots, moments, learnt, sizes, posterior, middle, lean, tilt, state.frame + 1,
             waiting,
-        )
+        )  # fmt: skip
         return _Step(after, seen, posterior)
 
     def _poses(self, found: Sequence[tuple[_Seen, ArmState]]) -> FramePose:
