@@ -21,12 +21,14 @@ class BvhNode(NamedTuple):
 
     Attributes:
         name: of the node. parent: index of its parent, -1 for the root.
-        offset: from the parent at rest, in the unit of the file.
+        offset: from the parent at rest, in the unit of the file. end: from the node to the point in which it
+            ends, if it has no child.
     """
 
     name: str
     parent: int
     offset: tuple[float, float, float] = _NOWHERE
+    end: tuple[float, float, float] = _NOWHERE
 
 
 def bvh_angles(rotations: Float[Tensor, "T N 3 3"]) -> Float[Tensor, "T N 3"]:
@@ -84,7 +86,7 @@ def _hierarchy(nodes: Sequence[BvhNode]) -> list[str]:
             lines += [
                 f"{tab}\tEnd Site",
                 f"{tab}\t{{",
-                f"{tab}\t\t{_offset(_NOWHERE)}",
+                f"{tab}\t\t{_offset(node.end)}",
                 f"{tab}\t}}",
             ]
     return lines + _closed(depths[-1:], 0)

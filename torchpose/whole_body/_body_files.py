@@ -1,5 +1,6 @@
 """Write whole bodies for biomechanics and animation: TRC and C3D of markers, BVH of a skeleton."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,11 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_choice
+from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._kinematics import Body
-from torchpose.body._skeleton import BodySkeleton
+from torchpose.body._skeleton import BODY_15
 from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
 from torchpose.io._c3d_file import write_c3d
 from torchpose.io._trc_file import write_trc
+from torchpose.whole_body._body_feet import BodyFeet
 
 BODY_FORMATS = ("trc", "c3d", "bvh")
 UP_AXES = ("z", "y")
@@ -26,6 +29,7 @@ class BodyMotion3d(NamedTuple):
     Attributes:
         body: the body of the person. state: of that body. joints: metres, world axes.
         std: of the joints, metres. fps: frames per second. first_frame: number of the first frame.
+        feet: of the person, None where they were not tracked.
     """
 
     body: Body
@@ -34,6 +38,7 @@ class BodyMotion3d(NamedTuple):
     std: Float[Tensor, "T J"]
     fps: float
     first_frame: int
+    feet: BodyFeet | None = None
 
 
 def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None = None) -> None:
@@ -50,33 +55,37 @@ def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None = Non
     kind = path.suffix.lower().removeprefix(".")
     check_choice("the suffix of a file of bodies", kind, BODY_FORMATS)
     turn = _turn_to_y_up(up).to(motion.joints)
-    joints, names = motion.joints @ turn.mT, marker_names(motion.body.skeleton)
+    joints, std, names = motion.joints, motion.std, motion.body.skeleton.names
+    if motion.feet is not None:
+        joints = torch.cat([joints, motion.feet.points3d.to(joints)], 1)
+        std = torch.cat([std, motion.feet.points_std().to(std)], 1)
+        names = (*names, *motion.feet.names)
+    joints, names = joints @ turn.mT, marker_names(names)
     if kind == "bvh":
         _write_skeleton(path, motion, turn)
     elif kind == "trc":
         write_trc(path, joints, names, motion.fps, first_frame=motion.first_frame)
     else:
         write_c3d(
-            path, joints, names, motion.fps, std=motion.std, y_up=up is not None,
+            path, joints, names, motion.fps, std=std, y_up=up is not None,
             first_frame=motion.first_frame,
         )  # fmt: skip
 
 
-def marker_names(skeleton: BodySkeleton) -> tuple[str, ...]:
-    """Return the names of the joints as Pose2Sim and its models for OpenSim have them.
+def marker_names(joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of joints as Pose2Sim and its models for OpenSim have them.
 
-    >>> from torchpose.body import BODY_15
-    >>> marker_names(BODY_15)[:5]
-    ('CHip', 'Neck', 'Head', 'LShoulder', 'LElbow')
+    >>> marker_names(("pelvis", "neck", "left_elbow", "right_big_toe"))
+    ('CHip', 'Neck', 'LElbow', 'RBigToe')
     """
-    return tuple(map(_marker_name, skeleton.names))
+    return tuple(map(_marker_name, joints))
 
 
 def _marker_name(joint: str) -> str:
     if joint == "pelvis":
         return "CHip"
-    side, _, kind = joint.rpartition("_")
-    return side[:1].upper() + kind.capitalize()
+    *side, kind = joint.split("_", 1)
+    return "".join(side)[:1].upper() + "".join(word.capitalize() for word in kind.split("_"))
 
 
 def _turn_to_y_up(up: str | None) -> Float[Tensor, "3 3"]:
@@ -99,11 +108,20 @@ class _PartNode(NamedTuple):
 
 
 def _write_skeleton(path: Path, motion: BodyMotion3d, turn: Float[Tensor, "3 3"]) -> None:
-    """Write the rigid body of a track: the bones that it has in every frame, turned by the states."""
-    nodes = _part_nodes(motion.body)
+    """Write the rigid body of a track: the bones that it has in every frame, turned by the states.
+
+    Feet that were tracked are joints in the places of the ankles, each with an end at its big toe.
+    """
     state = motion.state.detach().cpu().double()
     turn = turn.cpu().double()
-    parts = turn @ motion.body.part_rotations(state.to(motion.body.bone_lengths)).cpu().double()
+    parts = motion.body.part_rotations(state.to(motion.body.bone_lengths)).cpu().double()
+    toes: list[Tensor] = []
+    if motion.feet is not None:
+        feet = parts[:, [BODY_15.part_of[a] for a in ANKLES]] @ motion.feet.rotation.cpu().double()
+        toes = [*_toes(motion.feet, motion.joints, feet)]
+        parts = torch.cat([parts, feet], 1)
+    nodes = _part_nodes(motion.body, toes)
+    parts = turn @ parts
     world = torch.stack([parts[:, node.part] for node in nodes], 1)
     parents = [node.node.parent for node in nodes]
     above = world[:, [max(parent, 0) for parent in parents]]
@@ -112,14 +130,29 @@ def _write_skeleton(path: Path, motion: BodyMotion3d, turn: Float[Tensor, "3 3"]
     write_bvh_motion(path, [node.node for node in nodes], position, bvh_angles(local), motion.fps)
 
 
-def _part_nodes(body: Body) -> list[_PartNode]:
-    """Return a node for every joint, depth first, and one for every further part that turns about it."""
+def _toes(
+    feet: BodyFeet, joints: Float[Tensor, "T J 3"], rotations: Float[Tensor, "T 2 3 3"]
+) -> Float[Tensor, "2 3"]:
+    """Return the median big toes from the ankles in the axes of the feet, centimetres."""
+    toes = [FEET.index(f"{side}_big_toe") for side in ("left", "right")]
+    away = (feet.points3d[:, toes] - joints[:, ANKLES]).cpu().double()
+    return _CENTIMETRES * (rotations.mT @ away[..., None]).squeeze(-1).median(0).values
+
+
+def _part_nodes(body: Body, toes: Sequence[Float[Tensor, "3"]] = ()) -> list[_PartNode]:
+    """Return a node for every joint, depth first, and one for every further part that turns about it.
+
+    Args:
+        body: of the person. toes: ends of both feet, whose parts follow on those of the body; or none.
+    """
     nodes: list[_PartNode] = []
-    _add_joint(nodes, body, 0, -1)
+    _add_joint(nodes, body, 0, -1, dict(zip(ANKLES, toes, strict=False)))
     return nodes
 
 
-def _add_joint(nodes: list[_PartNode], body: Body, joint: int, parent: int) -> None:
+def _add_joint(
+    nodes: list[_PartNode], body: Body, joint: int, parent: int, toes: Mapping[int, Tensor]
+) -> None:
     """Append the node of a joint and all below it.
 
     A node turns with the part of the bones that leave it. Where these are of several parts, it turns with
@@ -134,10 +167,15 @@ def _add_joint(nodes: list[_PartNode], body: Body, joint: int, parent: int) -> N
     x, y, z = (_CENTIMETRES * body.offsets[joint]).tolist() if parent >= 0 else (0.0, 0.0, 0.0)
     here = len(nodes)
     nodes.append(_PartNode(BvhNode(skeleton.names[joint], parent, (x, y, z)), own))
+    if joint in toes:
+        foot = skeleton.names[joint].replace("ankle", "foot")
+        part = len(skeleton.parts) + ANKLES.index(joint)
+        end_x, end_y, end_z = toes[joint].tolist()
+        nodes.append(_PartNode(BvhNode(foot, here, end=(end_x, end_y, end_z)), part))
     for part, joints in children.items():
         base = here
         if part != own:
             base = len(nodes)
             nodes.append(_PartNode(BvhNode(f"{skeleton.parts[part]}_base", here), part))
         for child in joints:
-            _add_joint(nodes, body, child, base)
+            _add_joint(nodes, body, child, base, toes)

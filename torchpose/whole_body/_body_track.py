@@ -17,6 +17,7 @@ from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
+from torchpose.whole_body._body_feet import SIZES_OF_FEET, BodyFeet, feet_of
 from torchpose.whole_body._body_files import BodyMotion3d, write_body_file
 from torchpose.whole_body._filters.body_particles import first_true
 
@@ -71,7 +72,8 @@ class BodyTrack:
         details: what only some filters report, by name, [T, ...] each (`BodyFilterOutput.details`), such
             as "acceptance", "clamped" and "actions" of `ConstrainedParticleFilter`; of "kalman" "inlier"
             [T, C, J] (probability that a camera's keypoint was the joint's), "exchanged" [T, C, 2] (that
-            left and right were exchanged, of arms and of legs) and "bone_lengths" [T, J], metres.
+            left and right were exchanged, of arms and of legs), "bone_lengths" [T, J], metres, and where
+            keypoints have some of feet what `feet` is made of.
         action_names: the names of the columns of ``details["actions"]``.
         method: the name of the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files
             of older releases.
@@ -100,6 +102,11 @@ class BodyTrack:
     def names(self) -> tuple[str, ...]:
         """Return the names of the joints."""
         return self.body.skeleton.names
+
+    @property
+    def feet(self) -> BodyFeet | None:
+        """Return heels and toes with their covariances, and the ankles; None where no keypoint was of a foot."""
+        return feet_of(self.details)
 
     @property
     def failed_at(self) -> Int[Tensor, ""]:
@@ -208,6 +215,13 @@ class BodyTrack:
                 f"{path}: expected {_DETAIL}actions of {len(self.action_names)} actions, got the sizes "
                 f"{list(actions.shape)}"
             )
+        for name, sizes in SIZES_OF_FEET.items():
+            value = self.details.get(name)
+            if value is not None and tuple(value.shape[1:]) != sizes:
+                raise FileFormatError(
+                    f"{path}: expected {_DETAIL}{name} of the sizes {[len(self), *sizes]}, got "
+                    f"{list(value.shape)!s:.60}"
+                )
         inlier = self.details.get("inlier")
         if inlier is not None and (inlier.ndim != 3 or inlier.shape[2] != len(self.names)):
             raise FileFormatError(
@@ -224,8 +238,8 @@ class BodyTrack:
         """Write the poses for other programs: ``.trc`` (OpenSim), ``.c3d`` or ``.bvh``, by the suffix.
 
         TRC and C3D hold `joints3d` as markers with the names of Pose2Sim (RHip, LKnee, CHip, ...), in
-        metres and in millimetres; the residuals of C3D are standard deviations. BVH holds the rigid body
-        that `state` turns, in centimetres. A frame rate that is not known is written as 30.
+        metres and in millimetres, and heels and toes where `feet` are there; the residuals of C3D are standard
+        deviations. BVH holds the rigid body that `state` turns, in centimetres. A frame rate that is not known is written as 30.
 
         Args:
             path: the file, which is replaced if there is one.
@@ -237,7 +251,7 @@ class BodyTrack:
         """
         motion = BodyMotion3d(
             self.body, self.state, self.joints3d, self.joints_std(), self.fps or _FPS,
-            self.first_frame,
+            self.first_frame, self.feet,
         )  # fmt: skip
         write_body_file(path, motion, up)
 

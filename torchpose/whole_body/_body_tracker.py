@@ -42,11 +42,10 @@ from torchpose.whole_body._following import Observed
 from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     KEYPOINT_METHOD,
     KeypointBodyTracker,
+    LiveBody,
 )
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
-from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
-from torchpose.whole_body._keypoints.people_body_tracker import PeopleBodyTracker
-from torchpose.whole_body._keypoints.people_tracker import PeopleStream
+from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
 from torchpose.whole_body._measured_keypoints import given_keypoints
 from torchpose.whole_body._particle_follower import ParticleFollower
 
@@ -61,7 +60,7 @@ class BodyStream(NamedTuple):
         generator: of random numbers. names: of the keypoints of every frame that states none.
     """
 
-    filter: BodyFilterState | KeypointStream | PeopleStream | None
+    filter: BodyFilterState | LiveBody | LivePeople | None
     frame: int
     generator: torch.Generator | None
     names: tuple[str, ...] | None = None
@@ -490,11 +489,11 @@ class BodyTracker(nn.Module):
         _check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
-        if (isinstance(state.filter, PeopleStream) != (persons is not None)) and state.filter:
+        if (isinstance(state.filter, LivePeople) != (persons is not None)) and state.filter:
             raise InputError("persons must be given in all steps of a stream or in none")
         if persons is not None:
             return self._step_people(state, keypoints, confidence, names, covariance, persons)
-        assert not isinstance(state.filter, PeopleStream)
+        assert not isinstance(state.filter, LivePeople)
         after, pose = self.by_keypoints.step(
             state.filter, keypoints, confidence, names, covariance=covariance
         )
@@ -566,7 +565,7 @@ class BodyTracker(nn.Module):
     ) -> tuple[BodyStream, list[BodyTrack]]:
         """Track the persons of one more frame."""
         assert self.by_keypoints is not None  # or there is no state without particles
-        before = state.filter if isinstance(state.filter, PeopleStream) else None
+        before = state.filter if isinstance(state.filter, LivePeople) else None
         after, poses = PeopleBodyTracker(self.by_keypoints, persons).step(
             before, keypoints, confidence, names, covariance=covariance
         )

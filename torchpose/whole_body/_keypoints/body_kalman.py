@@ -31,6 +31,13 @@ from torchpose.whole_body._keypoints.body_transition import (
     jump_variance,
     transition,
 )
+from torchpose.whole_body._keypoints.information_step import (
+    InformationStep,
+    blocks_of,
+    information_step,
+    plus_one,
+    unit,
+)
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     NOISE_SCALES,
@@ -53,10 +60,6 @@ from torchpose.whole_body._keypoints.upright import Upright, upright_of
 FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
 
-_JITTER = (
-    1e-9  # share of a joint's information that is added along every axis, so that it has a factor
-)
-_LEAST_INFORMATION = 1e-9  # per square metre, of joints that no camera measures
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
@@ -132,15 +135,6 @@ class _Linearised(NamedTuple):
     weighed: Weighed
 
 
-class _Step(NamedTuple):
-    """Holds a step of an iteration: d [B, N], y' [B, 3 J], Cholesky factor, U with P' = P - U^T U."""
-
-    step: Tensor
-    pulled: Tensor
-    chol: Tensor
-    U: Tensor
-
-
 class BodyKalmanFilter(nn.Module):
     """Filters Gaussians over body states from keypoints in C cameras.
 
@@ -212,7 +206,7 @@ class BodyKalmanFilter(nn.Module):
         HP = state.cov[..., columns, :]
         G = HP[..., columns]
         L = torch.linalg.cholesky(share * pull.curvature)
-        chol = torch.linalg.cholesky(_plus_one(L.mT @ G @ L))
+        chol = torch.linalg.cholesky(plus_one(L.mT @ G @ L))
         U = torch.linalg.solve_triangular(chol, L.mT @ HP, upper=False)
         y = share * pull.slope
         solved = torch.cholesky_solve(L.mT @ (G @ y[..., None]), chol)
@@ -291,7 +285,7 @@ class BodyKalmanFilter(nn.Module):
             d = step.step
             point = self.articulation.moved(state.mean, d)
             UH = step.U @ found.H.mT
-            joint_cov, G, found = _blocks(found.G - UH.mT @ UH), found.G, None
+            joint_cov, G, found = blocks_of(found.G - UH.mT @ UH), found.G, None
         assert joint_cov is not None  # there is a step at least
         return self._corrected(state, readings, point, joint_cov, step, G)
 
@@ -311,26 +305,15 @@ class BodyKalmanFilter(nn.Module):
         seen = see(self.maps, joints)
         weighed = weigh(
             readings, seen, self.maps, state.beliefs, self.exchange,
-            _blocks(G) if joint_cov is None else joint_cov,
+            blocks_of(G) if joint_cov is None else joint_cov,
             marginal=joint_cov is None, decide=width < _DECIDED, width=width,
         )  # fmt: skip
         return _Linearised(H, HP, G, seen, weighed)
 
-    def _step(self, readings: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]) -> _Step:
+    def _step(self, readings: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]) -> InformationStep:
         """Return one step of Gauss and Newton from the prediction."""
         H, HP, G, seen, weighed = found
-        W, b = information(readings, seen, weighed)
-        L = _factors(W)
-        LHP = (L.mT @ HP.unflatten(-2, (-1, 3))).flatten(-3, -2)
-        LGL = ((LHP @ H.mT).unflatten(-1, (-1, 3)).transpose(-3, -2) @ L).transpose(-3, -2)
-        chol = torch.linalg.cholesky(_plus_one(LGL.flatten(-2)))
-        U = torch.linalg.solve_triangular(chol, LHP, upper=False)
-        moved = (H @ d[..., None]).unflatten(-2, (-1, 3))
-        y = (b[..., None] + W @ moved).flatten(-3, -2)
-        Gy = (G @ y).unflatten(-2, (-1, 3))
-        solved = torch.cholesky_solve((L.mT @ Gy).flatten(-3, -2), chol)
-        pulled = y - (L @ solved.unflatten(-2, (-1, 3))).flatten(-3, -2)
-        return _Step((HP.mT @ pulled).squeeze(-1), pulled.squeeze(-1), chol, U)
+        return information_step(H, HP, G, *information(readings, seen, weighed), d)
 
     def _corrected(
         self,
@@ -338,7 +321,7 @@ class BodyKalmanFilter(nn.Module):
         readings: KeypointFrame,
         point: BodyPoint,
         joint_cov: Tensor,
-        step: _Step,
+        step: InformationStep,
         G: Tensor,
     ) -> CorrectedBody:
         a = self.articulation
@@ -412,32 +395,10 @@ class BodyKalmanFilter(nn.Module):
         self, state: BodyGaussian, readings: KeypointFrame, found: _Linearised
     ) -> tuple[Float[Tensor, "B J"], Bool[Tensor, "B J"]]:
         """Return the log-odds of joints elsewhere than predicted, given the keypoints, and which are."""
-        far = _blocks(found.G) + _JUMP**2 * _eye(3, found.G)
+        far = blocks_of(found.G) + _JUMP**2 * unit(3, found.G)
         at_large = weigh(
             readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )
         doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
-
-
-def _plus_one(matrix: Tensor) -> Tensor:
-    """Return the symmetric part of a matrix plus the unit matrix."""
-    return (matrix + matrix.mT) / 2 + _eye(matrix.shape[-1], matrix)
-
-
-def _eye(size: int, like: Tensor) -> Tensor:
-    """Return a unit matrix of the dtype and on the device of a tensor."""
-    return torch.eye(size, dtype=like.dtype, device=like.device)
-
-
-def _factors(W: Float[Tensor, "B J 3 3"]) -> Tensor:
-    """Return Cholesky factors of information that may be singular."""
-    least = _JITTER * W.diagonal(dim1=-2, dim2=-1).sum(-1) + _LEAST_INFORMATION
-    return torch.linalg.cholesky(W + least[..., None, None] * _eye(3, W))
-
-
-def _blocks(matrix: Float[Tensor, "B J3 J3"]) -> Float[Tensor, "B J 3 3"]:
-    """Return the diagonal blocks of three rows."""
-    blocks = matrix.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
-    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)

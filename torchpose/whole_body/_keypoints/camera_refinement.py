@@ -96,8 +96,8 @@ def refine_cameras(
         errors.values[:, DELAY] = coarse_delays(rig, frames, longest).to(errors.values)
     for i in range(_ROUNDS):
         if i > 0 or bool(errors.values.any()):
-            known = poses if i > 0 else None
-            moved = _in_time(rig, frames, errors.values, known)
+            known = poses.joints[0] if i > 0 else None
+            moved = in_time(rig, frames, errors.values, known)
             poses = track(_corrected(rig, errors.values), moved, True)
         delays, stride = errors.values[:, DELAY], max(1, len(frames.pixels) // _FRAMES)
         given = given_for(frames, poses.joints[0], delays, free, fps, exchange, stride)
@@ -108,7 +108,7 @@ def refine_cameras(
             break
     assert adjusted is not None
     better = _corrected(rig, errors.values)
-    moved = _in_time(rig, frames, errors.values, poses)
+    moved = in_time(rig, frames, errors.values, poses.joints[0])
     after = track(better, moved, smoothing)
     gain = _gain(frames, before, after, errors.values[:, DELAY].round()) - adjusted.price
     if gain > _LEAST_GAIN:
@@ -181,22 +181,25 @@ def _velocities(joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T J 3"]:
     return torch.gradient(joints, dim=0)[0]
 
 
-def _in_time(
+def in_time(
     rig: CameraRig,
     frames: KeypointFrame,
     values: Float[Tensor, "C 7"],
-    poses: KeypointPoses | None,
+    joints: Float[Tensor, "T J 3"] | None,
 ) -> KeypointFrame:
     """Return keypoints in time with the first camera.
 
     They are those of the nearest frame that there is, moved by the velocity of their joints for the rest of
     the delay, z + A v (d - round d). None are averaged, which would make their noise look smaller.
+
+    Args:
+        rig: as given. frames: keypoints [T, C, J]. values: errors of the cameras.
+        joints: whose velocities keypoints have, metres; None leaves the rest of the delay.
     """
     delays = values[:, DELAY]
     moved, shifts = shifted(frames, delays.round().long(), _BEYOND)
-    if poses is None:
+    if joints is None:
         return moved
-    joints = poses.joints[0]
     seen = see(RigMaps.of(_corrected(rig, values)), joints)
     by_frame = (seen.by_joint @ _velocities(joints)[:, None, ..., None]).squeeze(-1)
     rest = delays - shifts

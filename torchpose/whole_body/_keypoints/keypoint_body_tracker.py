@@ -1,9 +1,10 @@
 """Track one person or several recordings through keypoints of calibrated cameras, to `BodyTrack`."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,12 +17,15 @@ from torchpose._core.checks import (
     check_positive,
     check_shape,
 )
+from torchpose.body._feet import ANKLES, FEET, foot_points
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeError
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.priors._foot_prior import shipped_foot_prior
 from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._body_feet import ESTIMATES_OF_FEET, details_of_feet
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_notes import (
     doubt_cameras,
@@ -33,10 +37,13 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     REFINED,
     RefinedCameras,
     details_of_cameras,
+    in_time,
     refine_cameras,
 )
 from torchpose.whole_body._keypoints.camera_units import check_units
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.foot_filter import FootFilter, FootGaussian, FootPoses
+from torchpose.whole_body._keypoints.foot_tracker import step_feet, track_feet
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_notes import (
     TOO_FEW,
     late_note,
@@ -56,6 +63,7 @@ from torchpose.whole_body._keypoints.known_person import of_one_camera, with_bod
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
 
+T = TypeVar("T")
 KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
 INLIER = (0.05, 0.97)
@@ -66,6 +74,13 @@ _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
 _LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
+
+
+class LiveBody(NamedTuple):
+    """Holds the state of tracking one person live: of the body, and of the feet if keypoints have some."""
+
+    body: KeypointStream
+    feet: FootGaussian | None
 
 
 class KeypointBodyTracker(nn.Module):
@@ -115,6 +130,7 @@ class KeypointBodyTracker(nn.Module):
             rig, self.fps, motion, up=up, lasting_std=lasting,
             lone=LoneNoise((std_of_one / self.keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
         )  # fmt: skip
+        self.feet = FootFilter(motion.articulation, copy.deepcopy(shipped_foot_prior()), self.fps)
 
     @property
     def rig(self) -> CameraRig:
@@ -145,17 +161,22 @@ class KeypointBodyTracker(nn.Module):
             raise InputError(
                 f"keypoints must hold at least one sequence, got {list(keypoints.shape)}"
             )
-        frames = self.frames(keypoints, confidence, names, covariance)
+        frames, feet = self.frames_and_feet(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
         if single:
             frames = frames.map(lambda value: value[None])
+            feet = None if feet is None else feet.map(lambda value: value[None])
         check_units(self.tracker.filter, frames)
         begun = self.first_frames(frames)
         if refine != "none":
-            frames = frames.map(lambda value: value[:, begun[0] :])
-            return self._refined_track(frames, refine, smoothing == "full", progress, begun[0])
+            from_begun = (None if x is None else x.map(lambda v: v[:, begun[0] :]) for x in (frames, feet))
+            return self._refined_track(*from_begun, refine, smoothing == "full", progress, begun[0])
         poses = self.tracker(frames, smoothing == "full", progress)
-        tracks = [self.track(poses, frames, b, cameras=b == 0) for b in range(len(frames.pixels))]
+        found = self.feet_of(poses, feet, smoothing == "full")
+        tracks = [
+            self.track(poses, frames, b, cameras=b == 0, feet=found)
+            for b in range(len(frames.pixels))
+        ]
         for track in tracks:
             track.notes += late_note(track.first_frame, TOO_FEW)
         return tracks[0] if single else tracks
@@ -163,22 +184,37 @@ class KeypointBodyTracker(nn.Module):
     @torch.no_grad()
     def step(
         self,
-        stream: KeypointStream | None,
+        stream: LiveBody | None,
         keypoints: Float[Tensor, "C J 2"],
         confidence: Float[Tensor, "C J"] | None = None,
         names: Sequence[str] | None = None,
         *,
         covariance: Float[Tensor, "C J"] | None = None,
-    ) -> tuple[KeypointStream, BodyTrack]:
+    ) -> tuple[LiveBody, BodyTrack]:
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
-        frame = self.frames(keypoints, confidence, names, covariance)
+        frame, feet = self.frames_and_feet(keypoints, confidence, names, covariance)
         frame = frame.map(lambda value: value[None])
-        stream, pose, _ = self.tracker.advance(stream, frame)
-        poses = _with_time(pose)
+        before, standing = (None, None) if stream is None else stream
+        body, pose, _ = self.tracker.advance(before, frame)
+        found = None
+        if feet is not None:
+            feet = feet.map(lambda value: value[None])
+            standing, found = step_feet(
+                self.feet, standing, self.tracker.filter.maps, pose, feet
+            )
+            found = with_time(found)
         frames = frame.map(lambda value: value[:, None])
-        track = self.track(poses, frames, 0, summed_up=False)
-        return stream, track if bool(stream.begun) else _unknown(track)
+        track = self.track(with_time(pose), frames, 0, summed_up=False, feet=found)
+        return LiveBody(body, standing), track if bool(body.begun) else _unknown(track)
+
+    def feet_of(
+        self, poses: KeypointPoses, frames: KeypointFrame | None, smoothing: bool
+    ) -> FootPoses | None:
+        """Return the feet of tracked bodies [B, T], None without keypoints of feet."""
+        if frames is None:
+            return None
+        return track_feet(self.feet, self.tracker.filter.maps, poses, frames, smoothing)
 
     # --- cameras ----------------------------------------------------------------------------------
 
@@ -198,7 +234,13 @@ class KeypointBodyTracker(nn.Module):
             )
 
     def _refined_track(
-        self, frames: KeypointFrame, refine: str, smoothing: bool, progress: bool, first_frame: int
+        self,
+        frames: KeypointFrame,
+        feet: KeypointFrame | None,
+        refine: str,
+        smoothing: bool,
+        progress: bool,
+        first_frame: int,
     ) -> BodyTrack:
         """Return the track with cameras without the errors that keypoints tell of."""
         former = self.tracker.filter
@@ -216,11 +258,26 @@ class KeypointBodyTracker(nn.Module):
             self.rig, single, track, self.fps, refine, former.exchange, smoothing
         )
         moved = found.frames.map(lambda value: value[None])
-        result = self.track(found.poses, moved, 0, refined=found, first_frame=first_frame)
+        standing = self._refined_feet(feet, found, smoothing)
+        result = self.track(
+            found.poses, moved, 0, refined=found, first_frame=first_frame, feet=standing
+        )
         late = late_note(result.first_frame, TOO_FEW)
         notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes, *late)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})
+
+    def _refined_feet(
+        self, feet: KeypointFrame | None, found: RefinedCameras, smoothing: bool
+    ) -> FootPoses | None:
+        """Return feet by corrected cameras; between frames they move as their ankles."""
+        if feet is None:
+            return None
+        ankles = [ankle for ankle in ANKLES for _ in range(len(FEET) // len(ANKLES))]
+        single = feet.map(lambda value: value[0])
+        moved = in_time(self.rig, single, found.errors.values, found.poses.joints[0][:, ankles])
+        frames = moved.map(lambda value: value[None])
+        return track_feet(self.feet, RigMaps.of(found.rig), found.poses, frames, smoothing)
 
     # --- keypoints --------------------------------------------------------------------------------
 
@@ -232,6 +289,16 @@ class KeypointBodyTracker(nn.Module):
         covariance: Tensor | None,
     ) -> KeypointFrame:
         """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
+        return self.frames_and_feet(keypoints, confidence, names, covariance)[0]
+
+    def frames_and_feet(
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        names: Sequence[str] | None,
+        covariance: Tensor | None,
+    ) -> tuple[KeypointFrame, KeypointFrame | None]:
+        """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them."""
         names = _names_of(keypoints, names)
         shape = keypoints.shape[:-1]
         for name, value in (("confidence", confidence), ("covariance", covariance)):
@@ -257,10 +324,23 @@ class KeypointBodyTracker(nn.Module):
                 raise InputError("covariance of keypoints must be positive, pixels squared")
         inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
-        table = body_joints(table.masked_fill(~there[..., None], torch.nan), names)
-        pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
-        self._check_inside(pixels)
-        pixels = self.rig.undistort_points(pixels)
+        table = table.masked_fill(~there[..., None], torch.nan)
+        body, feet = body_joints(table, names), foot_points(table, names)
+        self._check_inside(_pixels_of(body))
+        if feet is None:
+            return self._undistorted(body), None
+        n_joints = body.shape[-2]
+        both = self._undistorted(torch.cat([body, feet], -2))
+        axis = len(shape) - 1
+        n_points = both.inlier.shape[-1]
+        return (
+            both.map(lambda value: value.narrow(axis, 0, n_joints)),
+            both.map(lambda value: value.narrow(axis, n_joints, n_points - n_joints)),
+        )
+
+    def _undistorted(self, table: Float[Tensor, "*batch C J 5"]) -> KeypointFrame:
+        """Return keypoints of a table of pixels, both parts of the noise, and trust."""
+        pixels = self.rig.undistort_points(_pixels_of(table))
         known = pixels.isfinite().all(-1)  # some pixels are of no ray through the lens
         own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
         return KeypointFrame(
@@ -318,11 +398,15 @@ class KeypointBodyTracker(nn.Module):
         cameras: bool = True,
         refined: RefinedCameras | None = None,
         first_frame: int = 0,
+        feet: FootPoses | None = None,
     ) -> BodyTrack:
         """Return the track of one element of the batch, from the frame on in which it begins."""
         live = poses.started.shape[1] == 1
         begun = 0 if live else int(poses.started[b].int().argmax())
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
+        standing: dict[str, Tensor] = {}
+        if feet is not None:
+            standing = details_of_feet(mapped(lambda value: value[b, begun:], feet))
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
@@ -345,6 +429,7 @@ class KeypointBodyTracker(nn.Module):
                 "inlier": poses.inlier,
                 "exchanged": poses.exchanged,
                 "bone_lengths": bones.norm(dim=-1),
+                **standing,
             },
             method=KEYPOINT_METHOD,
         )
@@ -401,6 +486,11 @@ def _names_of(keypoints: Tensor, names: Sequence[str] | None) -> tuple[str, ...]
     return found
 
 
+def _pixels_of(table: Float[Tensor, "*batch C J 5"]) -> Float[Tensor, "*batch C J 2"]:
+    """Return the pixels of a table, NaN where there is no keypoint."""
+    return torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
+
+
 def _rigid_body(bones: Float[Tensor, "T J 3"], measured: Bool[Tensor, " T"]) -> Body:
     """Return the body of a track: the median bone of every joint in the axes of the part that carries it.
 
@@ -422,10 +512,15 @@ def _unknown(track: BodyTrack) -> BodyTrack:
     values: dict[str, Any] = {
         name: torch.full_like(getattr(track, name), torch.nan) for name in names
     }
-    return replace(track, **values)
+    feet = {
+        name: torch.full_like(value, torch.nan)
+        for name, value in track.details.items()
+        if name in ESTIMATES_OF_FEET
+    }
+    return replace(track, **values, details={**track.details, **feet})
 
 
-def _with_time(pose: KeypointPoses) -> KeypointPoses:
-    """Return the poses of one frame as those of a sequence of one."""
-    with_time: KeypointPoses = mapped(lambda value: value[:, None], pose)
-    return with_time
+def with_time(poses: T) -> T:
+    """Return what there is of one frame [B, ...] as of a sequence of one [B, 1, ...]."""
+    one: T = mapped(lambda value: value[:, None], poses)
+    return one

@@ -82,6 +82,7 @@ class KeypointPoses(NamedTuple):
             where tracking began. alone: [...], which of several cameras alone decided, -1 if all did.
         turns: [..., C], radians by which keypoints of a camera were turned back. off: [..., C], which cameras
             counted not.
+        scale: [..., C], factors of the cameras' noise.
     """
 
     joints: Tensor
@@ -96,6 +97,7 @@ class KeypointPoses(NamedTuple):
     alone: Tensor
     turns: Tensor
     off: Tensor
+    scale: Tensor
 
 
 KeypointStep = tuple[KeypointStream, KeypointPoses, CorrectedBody]
@@ -224,7 +226,7 @@ class KeypointTracker(nn.Module):
             found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
-            stream.faults.angle, stream.faults.off,
+            stream.faults.angle, stream.faults.off, found.state.scale,
         )  # fmt: skip
 
     def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:
@@ -339,6 +341,7 @@ class KeypointTracker(nn.Module):
             alone=alone,
             turns=pose.turns,
             off=pose.off,
+            scale=state.scale,
         )
         found = by_one._replace(state=state, weighed=found.weighed)
         return stream, pose, found

@@ -13,15 +13,24 @@ from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_units import check_units
+from torchpose.whole_body._keypoints.foot_filter import FootGaussian, FootPoses
+from torchpose.whole_body._keypoints.foot_tracker import continued, step_feet
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
-from torchpose.whole_body._keypoints.keypoint_body_tracker import SMOOTHING, KeypointBodyTracker
+from torchpose.whole_body._keypoints.keypoint_body_tracker import (
+    SMOOTHING,
+    KeypointBodyTracker,
+    with_time,
+)
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointPoses,
     stacked,
 )
 from torchpose.whole_body._keypoints.nested import taken
-from torchpose.whole_body._keypoints.people_association import pairs_of_detections
+from torchpose.whole_body._keypoints.people_association import (
+    pairs_of_detections,
+    taken_detections,
+)
 from torchpose.whole_body._keypoints.people_tracker import (
     PeopleFrame,
     PeopleStream,
@@ -39,6 +48,19 @@ class _Row(NamedTuple):
     time: int
     row: int
     frame: PeopleFrame
+
+
+class LivePeople(NamedTuple):
+    """Holds the state of tracking persons live.
+
+    Attributes:
+        people: their bodies. feet: of the persons of the frame before, None if keypoints have none.
+        numbers: of these persons.
+    """
+
+    people: PeopleStream
+    feet: FootGaussian | None
+    numbers: Tensor | None
 
 
 class PeopleBodyTracker:
@@ -75,7 +97,7 @@ class PeopleBodyTracker:
         """Return a track of each person, in the order in which they appear."""
         check_choice("smoothing", smoothing, SMOOTHING)
         check_shape("keypoints", keypoints, ["T", len(self.single.rig), "D", None, 2])
-        frames = self._frames(keypoints, confidence, names, covariance)
+        frames, feet = self._frames(keypoints, confidence, names, covariance)
         if not bool((frames.inlier > 0).any()):
             raise NobodySeenError("the detections have no keypoint in any camera and frame")
         stream, rows = None, defaultdict[int, list[_Row]](list)
@@ -91,28 +113,44 @@ class PeopleBodyTracker:
         self._check_units([row for _, i in named for row in persons[i]])
         if not named:
             self._check_units_of_pairs(frames)
-        return [self._track(persons[i], who, smoothing == "full") for who, i in named]
+        return [self._track(persons[i], who, feet, smoothing == "full") for who, i in named]
 
     @torch.no_grad()
     def step(
         self,
-        stream: PeopleStream | None,
+        stream: LivePeople | None,
         keypoints: Float[Tensor, "C D J 2"],
         confidence: Float[Tensor, "C D J"] | None = None,
         names: Sequence[str] | None = None,
         *,
         covariance: Float[Tensor, "C D J"] | None = None,
-    ) -> tuple[PeopleStream, list[BodyTrack]]:
+    ) -> tuple[LivePeople, list[BodyTrack]]:
         """Track one more frame; return the poses of those who are confirmed persons by now."""
         check_shape("keypoints", keypoints, [len(self.single.rig), "D", None, 2])
-        frame = self._frames(keypoints, confidence, names, covariance)
-        after, found = self.people.advance(stream, frame)
+        frame, seen = self._frames(keypoints, confidence, names, covariance)
+        after, found = self.people.advance(None if stream is None else stream.people, frame)
         if found is None:
-            return after, []
-        return after, [
-            self._track([_Row(0, row, found)], int(found.identity[row]), summed_up=False)
-            for row in (found.identity > 0).nonzero().flatten().tolist()
-        ]
+            return LivePeople(after, None, None), []
+        state, feet = self._feet_of_all(stream, found, seen)
+        tracks = []
+        for row in (found.identity > 0).nonzero().flatten().tolist():
+            own = None if feet is None else with_time(taken(feet, torch.tensor([row])))
+            who = int(found.identity[row])
+            tracks.append(self._track_of([_Row(0, row, found)], who, own, summed_up=False))
+        return LivePeople(after, state, found.number), tracks
+
+    def _feet_of_all(
+        self, stream: LivePeople | None, found: PeopleFrame, seen: KeypointFrame | None
+    ) -> tuple[FootGaussian | None, FootPoses | None]:
+        """Return the feet of all persons of a frame, and the state from which they go on."""
+        if seen is None:
+            return None, None
+        former = (None, None) if stream is None else (stream.feet, stream.numbers)
+        before, new = continued(*former, found.number)
+        keypoints = taken_detections(seen, found.detection)
+        maps = self.single.tracker.filter.maps
+        fresh = new | found.poses.started
+        return step_feet(self.single.feet, before, maps, found.poses, keypoints, fresh)
 
     # --- one person -------------------------------------------------------------------------------
 
@@ -122,11 +160,17 @@ class PeopleBodyTracker:
         confidence: Tensor | None,
         names: Sequence[str] | None,
         covariance: Tensor | None,
-    ) -> KeypointFrame:
-        """Return the detections as frames [..., D, C, J]."""
-        others = (None if v is None else v.transpose(-3, -2) for v in (confidence, covariance))
-        found = self.single.frames(keypoints.transpose(-4, -3), next(others), names, next(others))
-        return found if found.inlier.shape[-3] else _with_an_empty_one(found)
+    ) -> tuple[KeypointFrame, KeypointFrame | None]:
+        """Return the detections of bodies and of feet as frames [..., D, C, J]."""
+        trust, cov = (
+            None if v is None else v.transpose(-3, -2) for v in (confidence, covariance)
+        )
+        both = self.single.frames_and_feet(keypoints.transpose(-4, -3), trust, names, cov)
+        body, feet = (
+            one if one is None or one.inlier.shape[-3] else _with_an_empty_one(one) for one in both
+        )
+        assert body is not None
+        return body, feet
 
     def _check_units(self, rows: Sequence[_Row]) -> None:
         """Raise `CameraError` where cameras are not in metres, by the bones of all persons together."""
@@ -157,15 +201,37 @@ class PeopleBodyTracker:
         check_units(filter, found.take(rows).map(lambda value: value[:, None]))
 
     def _track(
-        self, rows: Sequence[_Row], person: int, smoothing: bool = False, summed_up: bool = True
+        self, rows: Sequence[_Row], person: int, feet: KeypointFrame | None, smoothing: bool
     ) -> BodyTrack:
-        """Return the track of one person."""
+        """Return the track of one person with the feet, of detections [T, D, C, 6]."""
         found = [taken(row.frame, torch.tensor([row.row])) for row in rows]
         poses: KeypointPoses = stacked([one.poses for one in found])
-        keypoints: KeypointFrame = stacked([one.keypoints for one in found])
         if smoothing:
             poses = self.single.tracker.smoothed(poses, [one.corrected for one in found])
-        track = self.single.track(poses, keypoints, 0, summed_up, first_frame=rows[0].time)
+        standing = None
+        if feet is not None:
+            seen = [
+                taken_detections(feet.map(lambda value: value[row.time]), one.detection)  # noqa: B023
+                for row, one in zip(rows, found, strict=True)
+            ]
+            standing = self.single.feet_of(poses, stacked(seen), smoothing)
+        return self._track_of(rows, person, standing, poses)
+
+    def _track_of(
+        self,
+        rows: Sequence[_Row],
+        person: int,
+        feet: FootPoses | None,
+        poses: KeypointPoses | None = None,
+        summed_up: bool = True,
+    ) -> BodyTrack:
+        """Return the track of one person; by default of the poses as they were filtered."""
+        found = [taken(row.frame, torch.tensor([row.row])) for row in rows]
+        poses = stacked([one.poses for one in found]) if poses is None else poses
+        keypoints: KeypointFrame = stacked([one.keypoints for one in found])
+        track = self.single.track(
+            poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet
+        )
         track.details["detection"] = torch.cat([one.detection for one in found])
         track.details["person"] = torch.full((len(rows),), person)
         return track

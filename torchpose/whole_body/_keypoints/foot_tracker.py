@@ -1,0 +1,118 @@
+"""Track the feet of bodies that are tracked: frame by frame, or whole sequences, filtered or smoothed."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from torchpose.math._gaussian import safe_cholesky
+from torchpose.whole_body._keypoints.foot_filter import (
+    FootFilter,
+    FootGaussian,
+    FootPoses,
+    exchanged_legs,
+)
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses, stacked
+from torchpose.whole_body._keypoints.nested import mapped
+
+
+def step_feet(
+    filter: FootFilter,
+    before: FootGaussian | None,
+    maps: RigMaps,
+    poses: KeypointPoses,
+    frame: KeypointFrame,
+    fresh: Bool[Tensor, " B"] | None = None,
+) -> tuple[FootGaussian, FootPoses]:
+    """Track the feet of one more frame.
+
+    Args:
+        filter: of feet. before: of the frame before, None before the first. maps: of the cameras.
+        poses: of the bodies [B]. frame: keypoints [B, C, 6].
+        fresh: of whom nothing is known from the frame before; by default those whose tracking begins.
+    """
+    legs = filter.legs(poses.point, poses.state_cov, poses.covariance)
+    beliefs = exchanged_legs(poses.exchanged, poses.scale)
+    fresh = poses.started if fresh is None else fresh
+    return filter.advance(before, legs, frame, maps, beliefs, fresh)
+
+
+def track_feet(
+    filter: FootFilter,
+    maps: RigMaps,
+    poses: KeypointPoses,
+    frames: KeypointFrame,
+    smoothing: bool = False,
+) -> FootPoses:
+    """Return the feet of whole sequences.
+
+    Args:
+        filter: of feet. maps: of the cameras. poses: of the bodies [B, T], smoothed where feet are to be.
+        frames: keypoints [B, T, C, 6]. smoothing: whether later frames count too.
+    """
+    every = filter.legs(poses.point, poses.state_cov, poses.covariance)
+    beliefs = exchanged_legs(poses.exchanged, poses.scale)
+    state: FootGaussian | None = None
+    states, found = [], []
+    for t in range(poses.started.shape[1]):
+        legs, frame, believed = mapped(lambda value: value[:, t], (every, frames, beliefs))  # noqa: B023
+        state, feet = filter.advance(state, legs, frame, maps, believed, poses.started[:, t])
+        states.append(state)
+        found.append(feet)
+    filtered: FootPoses = stacked(found)
+    if not smoothing:
+        return filtered
+    smoothed = smooth_feet(filter, states, poses.started.mT)
+    return filter.poses(smoothed, every, filtered.inlier)
+
+
+def smooth_feet(
+    filter: FootFilter, states: Sequence[FootGaussian], started: Bool[Tensor, "T B"]
+) -> FootGaussian:
+    """Return Gaussians [B, T] of whole sequences, after Rauch, Tung and Striebel.
+
+    m_t|T = m_t + C (m_t+1|T - m_t+1|t),   P_t|T = P_t + C (P_t+1|T - P_t+1|t) C^T,   C = P_t F^T P_t+1|t^-1.
+
+    Args:
+        filter: that filtered. states: posteriors of T frames.
+        started: frames in which tracking began anew, which say nothing of the frames before.
+    """
+    model = filter.motion
+    mean, cov, centre = (torch.stack(values) for values in zip(*states, strict=True))
+    carried = model.matrix @ cov[:-1]
+    predicted = carried @ model.matrix.mT + model.noise
+    gains = torch.cholesky_solve(carried, safe_cholesky(predicted)).mT
+    gains = gains * ~started[1:, :, None, None, None]
+    ahead = filter.carried(mean[:-1], centre[:-1], centre[1:])
+    means, covs = [mean[-1]], [cov[-1]]
+    for t in range(len(states) - 2, -1, -1):
+        step = (gains[t] @ (means[-1] - ahead[t])[..., None]).squeeze(-1)
+        means.append(mean[t] + step)
+        change = gains[t] @ (covs[-1] - predicted[t]) @ gains[t].mT
+        covs.append(cov[t] + (change + change.mT) / 2)
+    return FootGaussian(
+        torch.stack(means[::-1], 1), torch.stack(covs[::-1], 1), centre.transpose(0, 1)
+    )
+
+
+def continued(
+    before: FootGaussian | None, numbers: Tensor | None, now: Tensor
+) -> tuple[FootGaussian | None, Bool[Tensor, " P"]]:
+    """Return the feet of persons of the frame before in the order of those of a frame, and who is new.
+
+    Args:
+        before: of the persons with these numbers. numbers: unlike all others. now: numbers of a frame.
+    """
+    if before is None or numbers is None or not len(numbers):
+        return None, torch.ones_like(now, dtype=torch.bool)
+    same = now[:, None] == numbers
+    rows = same.int().argmax(1)
+    return mapped(lambda value: value[rows], before), ~same.any(1)
+
+
+def unknown_feet(feet: FootPoses) -> FootPoses:
+    """Return feet of which nothing is known: NaN, and no inliers."""
+    nothing: FootPoses = mapped(lambda value: torch.full_like(value, torch.nan), feet)
+    return nothing._replace(inlier=torch.zeros_like(feet.inlier))
