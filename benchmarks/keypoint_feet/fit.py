@@ -26,13 +26,15 @@ from torchpose.math._rotations import (
     minimal_rotation,
     quaternion_vector_to_matrix,
 )
-from torchpose.priors._foot_prior import FootPrior, FootPriorInfo, leg_columns, leg_features
+from torchpose.priors._foot_prior import FootPrior, FootPriorInfo, LegTurns
 
 __all__ = ["fit_shipped", "toes_of"]
 
 _LONGEST = 600  # frames of a recording
 _RIDGE = 0.01  # of the variance of a feature, of what each frame is
 _ROLL_STD = 0.15  # radians, about the line from ankle to toe, which nothing recorded tells
+_WIDER, _FASTER = 1.2, 1.4
+"""Factors on spread and speed, for feet that are not rigid, chosen with the filter on `clips.CHOOSING`."""
 _TOES = tuple(FEET.index(f"{side}_big_toe") for side in ("left", "right"))
 
 
@@ -85,16 +87,13 @@ def _feet_of(clip: MocapClip, origin: str) -> list[_Feet]:
     )  # fmt: skip
     state = fit_state(body, joints)
     n = len(state)
-    point = BodyPoint(
-        state[:, :3],
-        quaternion_vector_to_matrix(state[:, 3:].unflatten(-1, (-1, 3))),
-        state.new_zeros(n, articulation.n_pose),
-        state.new_zeros(n, len(articulation.groups)),
-        state.new_zeros(n, len(articulation.shifted), 3),
-    )
-    angles = articulation.relative_angles(point)
-    rates = clip.fps * torch.gradient(angles, dim=0)[0]
-    features = leg_features(angles, rates, *leg_columns(articulation))
+    rotations = quaternion_vector_to_matrix(state[:, 3:].unflatten(-1, (-1, 3)))
+    none = state.new_zeros(n, len(articulation.groups)), state.new_zeros(n, len(articulation.shifted), 3)
+    point = BodyPoint(state[:, :3], rotations, state.new_zeros(n, articulation.n_pose), *none)
+    rates = clip.fps * torch.gradient(articulation.relative_angles(point), dim=0)[0]
+    first = 3 + articulation.n_root
+    point.velocity[:, first:] = rates
+    features = LegTurns(articulation).features(point)
     shanks = [BODY_15.part_of[ankle] for ankle in ANKLES]
     shank = articulation.world_rotations(point)[:, shanks]
     seen = (shank.mT @ (toes_of(clip) - joints[:, ANKLES])[..., None]).squeeze(-1)
@@ -142,8 +141,9 @@ def _fitted(feet: Sequence[_Feet], info: FootPriorInfo) -> FootPrior:
     turn_std, rate = spread.sqrt(), (speed / spread).sqrt()
     turn_std[2], rate[2] = _ROLL_STD, rate[:2].mean()
     return FootPrior(
-        torch.as_tensor(mean), std, slope, torch.as_tensor(centre), turn_std, rate, info
-    )
+        torch.as_tensor(mean), std, slope, torch.as_tensor(centre), _WIDER * turn_std, _FASTER * rate,
+        info,
+    )  # fmt: skip
 
 
 def _weight(one: _Feet, feet: Sequence[_Feet]) -> float:

@@ -21,6 +21,14 @@ FEET = tuple(f"{side}_{point}" for side in _SIDES for point in _POINTS)
 ANKLES = tuple(BODY_15.joint(f"{side}_ankle") for side in _SIDES)
 """Joints about which feet turn."""
 
+FOOT_BONES = tuple(
+    pair
+    for side, ankle in enumerate(ANKLES)
+    for heel in (len(BODY_15.names) + 3 * side,)
+    for pair in ((ankle, heel), (heel, heel + 1), (heel, heel + 2), (ankle, heel + 1))
+)
+"""Lines between ankles, heels and toes, of the fifteen joints followed by `FEET`."""
+
 _SPELLINGS = {  # canonical names that may stand for a point, the best one first
     "heel": ("heel",),
     "big_toe": ("big_toe", "foot_index", "toe", "foot"),

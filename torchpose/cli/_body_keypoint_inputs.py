@@ -37,8 +37,9 @@ class CameraKeypoints(NamedTuple):
     """Holds the keypoints of one camera, of D detections: of everybody, or of one who is followed.
 
     Attributes:
-        points: of the joints of `BODY_15` [T, D, 15, 2], pixels, NaN where missing.
-        confidence: [T, D, 15].
+        points: of the joints of `BODY_15` [T, D, 15, 2], pixels, NaN where missing; if the input has feet
+            [T, D, 21, 2], followed by those of `FEET`.
+        confidence: [T, D, 15] or [T, D, 21].
         fps, size: of the images, (width, height), None if unknown. notes: of the reader.
         n_people: how many people the frames show [T], where one of them is followed.
         first: the number that the input gives to the first frame; None if it numbers none.
@@ -70,9 +71,10 @@ class BodyKeypoints(NamedTuple):
     """Holds the keypoints of all cameras, in step.
 
     Attributes:
-        points: of the joints of `BODY_15` [T, C, 15, 2], pixels, NaN where missing; of everybody
-            [T, C, D, 15, 2], of D detections in any order.
-        confidence: [T, C, 15] or [T, C, D, 15]. cameras: for the images in which the keypoints are.
+        points: of the joints of `BODY_15` [T, C, 15, 2], pixels, NaN where missing, if an input has feet
+            [T, C, 21, 2], followed by those of `FEET`; of everybody [T, C, D, ..., 2], of D detections in any
+            order.
+        confidence: as points, without pixels. cameras: for the images in which the keypoints are.
         fps: frames per second. notes: on what was assumed.
     """
 
@@ -81,6 +83,14 @@ class BodyKeypoints(NamedTuple):
     cameras: "list[PinholeCamera]"
     fps: float
     notes: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the keypoints."""
+        from torchpose.body._feet import FEET
+        from torchpose.body._skeleton import BODY_15
+
+        return (*BODY_15.names, *FEET)[: self.points.shape[-2]]
 
 
 def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
@@ -219,22 +229,24 @@ def _in_step(
         )
     n = min(lengths)
     rows = [slice(delay, delay + n) for delay in delays]
-    most = max(part.points.shape[1] for part in parts)
+    most, joints = (max(part.points.shape[axis] for part in parts) for axis in (1, 2))
     points = torch.stack(
-        [_padded(p.points[r], most, torch.nan) for p, r in zip(parts, rows, strict=True)], 1
+        [_padded(p.points[r], most, joints, torch.nan) for p, r in zip(parts, rows, strict=True)], 1
     )
     confidence = torch.stack(
-        [_padded(p.confidence[r], most, 0.0) for p, r in zip(parts, rows, strict=True)], 1
+        [_padded(p.confidence[r], most, joints, 0.0) for p, r in zip(parts, rows, strict=True)], 1
     )
     shown = ", ".join(map(str, lengths))
     note = f"the inputs have {shown} frames; the first {n} of each are used"
     return points, confidence, (note,) * (len(set(lengths)) > 1)
 
 
-def _padded(values: Tensor, most: int, missing: float) -> Tensor:
-    """Return values [T, D, ...] with more detections, which are missing."""
-    more = values.new_full((len(values), most - values.shape[1], *values.shape[2:]), missing)
-    return torch.cat([values, more], 1)
+def _padded(values: Tensor, most: int, joints: int, missing: float) -> Tensor:
+    """Return values [T, D, J, ...] with more detections and joints, which are missing."""
+    frames, _, _, *rest = values.shape
+    padded = values.new_full((frames, most, joints, *rest), missing)
+    padded[:, : values.shape[1], : values.shape[2]] = values
+    return padded
 
 
 # --- one camera -----------------------------------------------------------------------------------
@@ -266,10 +278,11 @@ def _read(
 def _of_body(
     source: str, points: Tensor, confidence: Tensor | None, names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
-    """Return keypoints [..., 15, 2] and confidence [..., 15] of the joints of `BODY_15`.
+    """Return keypoints [..., 15, 2] and confidence [..., 15] of the joints of `BODY_15`, and of feet if it has any.
 
     Heads and necks that were put where the prior of the upper body has them are none of this body.
     """
+    from torchpose.body._feet import foot_points
     from torchpose.body._skeleton import body_joints
 
     there = torch.isfinite(points).all(-1)
@@ -281,6 +294,8 @@ def _of_body(
         joints = body_joints(table, names[:given])
     except SkeletonError as error:
         raise SkeletonError(f"{source}: {error}") from error
+    feet = foot_points(table, names[:given])
+    joints = joints if feet is None else torch.cat([joints, feet], -2)
     return joints[..., :2], joints[..., 2].nan_to_num(0.0)
 
 

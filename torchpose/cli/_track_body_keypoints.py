@@ -192,7 +192,8 @@ def _track(
     with gate_is_in_a_note():
         try:
             found = tracker(
-                keypoints=keypoints.points, confidence=keypoints.confidence, **options,
+                keypoints=keypoints.points, confidence=keypoints.confidence, names=keypoints.names,
+                **options,
                 progress=show_progress(),
             )  # fmt: skip
         except NobodySeenError:
@@ -284,7 +285,7 @@ def _agreement(keypoints: BodyKeypoints, poses: "BodyTrack") -> str:
     there = keypoints.confidence[poses.first_frame :][: len(poses)] > 0
     shares = []
     for c, camera in enumerate(keypoints.cameras):
-        inlier = poses.details["inlier"][:, c][there[:, c]]
+        inlier = poses.details["inlier"][:, c][there[:, c, : len(poses.names)]]
         share = percent(float(inlier.mean())) if len(inlier) else "no keypoints"
         shares.append(f"{camera.name} {share}")
     return ", ".join(shares)
@@ -308,7 +309,7 @@ def _write_skeleton(path: "Path", poses: "BodyTrack", camera: "PinholeCamera") -
     seen = poses.seen_by(camera)
     figure = plot_body_strip(
         seen.joints3d[0], poses.body.skeleton, fps=poses.fps or 30.0,
-        first_frame=poses.first_frame, observed=seen.observed[0],
+        first_frame=poses.first_frame, observed=seen.observed[0], feet=poses.feet_seen_by(camera),
     )  # fmt: skip
     return save_figure(figure, path)
 
@@ -400,10 +401,13 @@ class Films:
 
         delays = poses.details.get("camera_delays", torch.zeros(1, len(self._cameras)))[0]
         at = int((t - poses.first_frame - delays[c].round().long()).clamp(0, len(poses) - 1))
+        feet = None
+        if poses.feet is not None:
+            feet = project_joints(poses.feet.points3d[at], self._cameras[c])
         return draw_body(
             image, project_joints(poses.joints3d[at], self._cameras[c]), poses.body.skeleton,
             keypoints=self._seen(t, c) if crosses else None,
-            label="" if tint is None else f"person {tint + 1}", tint=tint,
+            label="" if tint is None else f"person {tint + 1}", tint=tint, feet=feet,
         )  # fmt: skip
 
     def _open(self, i: int) -> "VideoSource":

@@ -124,15 +124,28 @@ def _write_poses(job: BodyJob, out: Path, poses: "BodyTrack", suffix: str) -> li
 
 
 def _write_csv(path: Path, poses: "BodyTrack") -> None:
-    """Write one row per frame: x, y, z of every joint in metres, and its standard deviation."""
-    from torchpose._core.files import atomic_path
+    """Write one row per frame: x, y, z of every joint in metres, and its standard deviation.
 
-    columns = [f"{n}_{axis}" for n in poses.names for axis in ("x", "y", "z", "std")]
-    rows = poses.joints3d.new_zeros(len(poses), len(poses.names), 4)
-    rows[..., :3], rows[..., 3] = poses.joints3d, poses.joints_std()
+    Feet, if there are any, follow: heels and toes as joints are, then angles of both ankles in degrees.
+    """
+    import torch
+
+    from torchpose._core.files import atomic_path
+    from torchpose.whole_body._body_feet import ANKLE_ANGLES
+
+    names, rows = poses.names, torch.cat([poses.joints3d, poses.joints_std()[..., None]], -1)
+    angles, feet = rows.new_zeros(len(rows), 0), poses.feet
+    more: list[str] = []
+    if feet is not None:
+        names = (*names, *feet.names)
+        rows = torch.cat([rows, torch.cat([feet.points3d, feet.points_std()[..., None]], -1)], 1)
+        angles = feet.angles.rad2deg().flatten(1)
+        more = [f"{side}_ankle_{angle}" for side in ("left", "right") for angle in ANKLE_ANGLES]
+    columns = [*(f"{n}_{axis}" for n in names for axis in ("x", "y", "z", "std")), *more]
+    rows = torch.cat([rows.flatten(1), angles], 1)
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(",".join(["frame", *columns, "coasting"]) + "\n")
-        for t, (row, coasting) in enumerate(zip(rows.flatten(1).tolist(), poses.coasting.tolist(),
+        for t, (row, coasting) in enumerate(zip(rows.tolist(), poses.coasting.tolist(),
                                                 strict=True)):  # fmt: skip
             cells = [str(t + poses.first_frame), *(f"{v:.4f}" for v in row), str(int(coasting))]
             stream.write(",".join(cells) + "\n")

@@ -17,6 +17,7 @@ from torchpose.body._skeleton import other_side
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "feet" / "whole-body.safetensors"
 _LEG = ("left_thigh", "left_shank", "right_thigh", "right_shank")
+_PLUS, _MINUS = {0: 7, 2: 3}, {0: 5, 2: 1}  # entries R32 - R23 and R21 - R12 of a matrix by its axis
 _FARTHEST = 3.0  # standard deviations, beyond which angles and rates count no more
 
 
@@ -53,8 +54,8 @@ _KIND = FileKind(
 class FootPrior(nn.Module):
     """Holds a prior over the rotation of feet relative to their shanks.
 
-    The rotation vector of a left foot is m + A^T f + x. The features f are the angles of both legs and their
-    rates, over their standard deviations. What is left, x, is a critically damped process about zero along
+    The rotation vector of a left foot is m + A^T f + x. The features f are the turns of both legs (sines of
+    angles times axes) and their rates, over their standard deviations. What is left, x, is a critically damped process about zero along
     each axis, with covariance s^2 (1 + r t) exp(-r t) over the time t. A right foot is the mirror image.
 
     Args:
@@ -68,8 +69,6 @@ class FootPrior(nn.Module):
     mean: Tensor
     turn_std: Tensor
     turn_rate: Tensor
-    columns: Tensor
-    signs: Tensor
     sides: Tensor
 
     def __init__(
@@ -83,33 +82,23 @@ class FootPrior(nn.Module):
         info: FootPriorInfo | None = None,
     ) -> None:
         super().__init__()
-        columns, signs = leg_columns(Articulation())
         own = {
             "feature_mean": feature_mean, "feature_std": feature_std, "slope": slope, "mean": mean,
-            "turn_std": turn_std, "turn_rate": turn_rate, "signs": signs,
+            "turn_std": turn_std, "turn_rate": turn_rate,
             "sides": torch.tensor([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]]),
         }  # fmt: skip
         with outside_inference():
             for name, value in own.items():
                 self.register_buffer(name, value.detach().double().clone(), persistent=False)
-        self.register_buffer("columns", columns, persistent=False)
+        self.legs = LegTurns(Articulation())
         self.info = info or FootPriorInfo()
 
-    def centre(self, angles: Tensor, rates: Tensor) -> Float[Tensor, "*batch 2 3"]:
-        """Return the expected rotation vectors m + A^T f of both feet, radians, in the axes of the shanks.
-
-        Args:
-            angles: [..., Q], `Articulation.relative_angles`. rates: [..., Q], their velocities, 1/s.
-        """
-        features = leg_features(angles, rates, self.columns, self.signs)
+    def centre(self, point: BodyPoint) -> Float[Tensor, "*batch 2 3"]:
+        """Return the expected rotation vectors m + A^T f of both feet, radians, in the axes of the shanks."""
+        features = self.legs.features(point)
         features = (features - self.feature_mean) / self.feature_std
         turned = self.mean + features.clamp(-_FARTHEST, _FARTHEST) @ self.slope
         return turned * self.sides
-
-    def centre_at(self, articulation: Articulation, point: BodyPoint) -> Float[Tensor, "*batch 2 3"]:
-        """Return `centre` of bodies."""
-        rates = point.velocity[..., 3 + articulation.n_root :]
-        return self.centre(articulation.relative_angles(point), rates)
 
     def save(self, path: str | Path) -> None:
         """Write the prior as safetensors; the file appears whole or not at all.
@@ -136,28 +125,38 @@ def shipped_foot_prior() -> FootPrior:
     return FootPrior.load(_SHIPPED)
 
 
-def leg_columns(articulation: Articulation) -> tuple[Tensor, Tensor]:
-    """Return which of the relative angles are those of the legs [2, 8], and their signs in the mirror.
+class LegTurns(nn.Module):
+    """Computes how both legs are turned and turn, as each foot sees it: its own leg first, the right in a mirror.
 
-    The first row is for the left foot, the second for the right one, with the legs the other way round.
+    Args:
+        articulation: of the bodies.
     """
-    parts, first = articulation.skeleton.parts, articulation.n_root
-    places = [
-        (parts[part], axis)
-        for part, axis in zip(
-            articulation.axis_part[first:].tolist(), articulation.axis[first:].tolist(), strict=True
-        )
-    ]
-    legs = [(part, axis) for part in _LEG for axis in (0, 2)]
-    own = [places.index(place) for place in legs]
-    other = [places.index((other_side(part), axis)) for part, axis in legs]
-    mirrored = [1.0 if axis == 0 else -1.0 for _, axis in legs]
-    signs = torch.tensor([[1.0] * len(legs), mirrored], dtype=torch.float64)
-    return torch.tensor([own, other]), signs
 
+    plus: Tensor
+    minus: Tensor
+    rates: Tensor
+    signs: Tensor
 
-def leg_features(
-    angles: Tensor, rates: Tensor, columns: Tensor, signs: Tensor
-) -> Float[Tensor, "*batch 2 F"]:
-    """Return angles and rates of both legs, a foot's own leg first, in a mirror for the right foot."""
-    return torch.cat([values[..., columns] * signs for values in (angles, rates)], -1)
+    def __init__(self, articulation: Articulation) -> None:
+        super().__init__()
+        parts = articulation.skeleton.parts
+        turns = zip(articulation.axis_part.tolist(), articulation.axis.tolist(), strict=True)
+        places = [(parts[part], axis) for part, axis in turns]
+        legs = [(part, axis) for part in _LEG for axis in (0, 2)]
+        sides = [legs, [(other_side(part), axis) for part, axis in legs]]
+        index = {
+            "plus": [[9 * parts.index(p) + _PLUS[a] for p, a in side] for side in sides],
+            "minus": [[9 * parts.index(p) + _MINUS[a] for p, a in side] for side in sides],
+            "rates": [[3 + places.index(place) for place in side] for side in sides],
+        }
+        for name, value in index.items():
+            self.register_buffer(name, torch.tensor(value), persistent=False)
+        mirrored = [1.0 if axis == 0 else -1.0 for _, axis in legs]
+        signs = torch.tensor([[1.0] * len(legs), mirrored], dtype=torch.float64)
+        self.register_buffer("signs", torch.cat([signs / 2, signs], -1), persistent=False)
+
+    def features(self, point: BodyPoint) -> Float[Tensor, "*batch 2 F"]:
+        """Return the turns of both legs, sines of angles times axes, and their rates, 1/s."""
+        entries = point.rotations.flatten(-3)
+        twice = entries[..., self.plus] - entries[..., self.minus]
+        return torch.cat([twice, point.velocity[..., self.rates]], -1) * self.signs

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_rgb, check_shape
 from torchpose._core.images import Image
+from torchpose.body._feet import FEET, FOOT_BONES
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError
 from torchpose.metrics._calibration import chi2_quantile
@@ -297,6 +298,7 @@ def draw_body(
     keypoints: Float[Tensor, "K 2"] | None = None,
     label: str = "",
     tint: int | None = None,
+    feet: Float[Tensor, "6 2"] | None = None,
 ) -> Image:
     """Return a copy of a frame with a body, its silhouette and what was measured drawn on it.
 
@@ -311,6 +313,7 @@ def draw_body(
             there is none.
         label: a word or two over the head; ASCII.
         tint: index into `PERSON_TINTS`, of the trunk, the head and the label; by default they are white.
+        feet: pixels of heels and toes of a body of fifteen joints, if they were tracked.
 
     Returns:
         A new image of the same size.
@@ -331,6 +334,10 @@ def draw_body(
     for joint, parent in enumerate(skeleton.parents):
         if parent >= 0:
             pen.bone(points[parent], points[joint], colors[joint])
+    if feet is not None:
+        points, colors = points + feet.tolist(), colors + _joint_colors(FEET, own)
+        for start, end in FOOT_BONES:
+            pen.bone(points[start], points[end], colors[end])
     for point, color in zip(points, colors, strict=True):
         pen.joint(point, color, True)
     for point in [] if keypoints is None else keypoints.tolist():

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
+from torchpose.body._feet import ANKLES, FEET, FOOT_BONES
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.viz._skeletons import (
     _choose_frames,
@@ -45,6 +46,7 @@ def plot_body_strip(
     fps: float = 30.0,
     first_frame: int = 0,
     observed: Bool[Tensor, "T J"] | None = None,
+    feet: Float[Tensor, "T 6 3"] | None = None,
 ) -> Figure:
     """Return some frames of a body at one scale, as a camera sees it and from the side.
 
@@ -54,16 +56,23 @@ def plot_body_strip(
         joints: camera axes, metres. skeleton: whose joints they are.
         n_frames: number of frames to draw, spread over all. fps: frames per second, for the times above.
         first_frame: number of the first frame. observed: True = measured; the other joints are hollow.
+        feet: heels and toes of a body of fifteen joints, in the same axes, if they were tracked.
 
     Raises:
         ShapeError: joints of another shape. InputError: no frame.
             MissingDependencyError: matplotlib is missing.
     """
     check_shape("joints", joints, [None, len(skeleton.names), 3])
+    names = skeleton.names
+    limbs = [(parent, joint) for joint, parent in enumerate(skeleton.parents) if parent >= 0]
+    if feet is not None:
+        joints, names = torch.cat([joints, feet.to(joints)], 1), (*names, *FEET)
+        limbs += FOOT_BONES
+        if observed is not None:
+            observed = torch.cat([observed, observed[:, [a for a in ANKLES for _ in range(3)]]], 1)
     frames = _choose_frames(None, n_frames, len(joints))
     centred = joints - joints[:, :1]
     low, high = _limits(centred[frames], margin=0.06)
-    limbs = [(parent, joint) for joint, parent in enumerate(skeleton.parents) if parent >= 0]
     wide = float(torch.maximum((high - low)[0], (high - low)[2]))
     middle = float(low[0] + high[0]) / 2
     low[0], high[0] = middle - wide / 2, middle + wide / 2
@@ -76,7 +85,7 @@ def plot_body_strip(
             ax.set_axis_off()
             draw_skeleton(
                 ax, centred[frame][:, pick], observed=None if observed is None else observed[frame],
-                colors=joint_colors(skeleton.names), limbs=limbs, linewidth=2.2,
+                colors=joint_colors(names), limbs=limbs, linewidth=2.2,
             )  # fmt: skip
             _set_view(ax, low, high, pick)
             if column == 0:

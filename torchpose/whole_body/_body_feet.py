@@ -8,17 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.body._feet import FEET
-from torchpose.whole_body._keypoints.foot_filter import FootPoses
 
-_DETAILS = {
-    "feet": "points",
-    "feet_covariance": "covariance",
-    "feet_inlier": "inlier",
-    "foot_rotation": "rotation",
-    "foot_rotation_covariance": "rotation_cov",
-}
-ESTIMATES_OF_FEET = tuple(name for name, field in _DETAILS.items() if field != "inlier")
-"""Details that are NaN where no person was found."""
+DETAILS_OF_FEET = ("feet", "feet_covariance", "feet_inlier", "foot_rotation", "foot_rotation_covariance")
+"""Names of the details of a track that hold feet."""
 SIZES_OF_FEET = {
     "feet": (6, 3), "feet_covariance": (6, 3, 3), "foot_rotation": (2, 3, 3),
     "foot_rotation_covariance": (2, 3, 3),
@@ -77,13 +69,8 @@ class BodyFeet:
         return variance.clamp_min(0).sqrt()
 
 
-def details_of_feet(feet: FootPoses) -> dict[str, Tensor]:
-    """Return the details of a track that hold feet."""
-    return {name: getattr(feet, field) for name, field in _DETAILS.items()}
-
-
 def feet_of(details: Mapping[str, Tensor]) -> BodyFeet | None:
     """Return the feet that details of a track hold; None if they hold none."""
-    if not set(_DETAILS) <= set(details):
+    if not set(DETAILS_OF_FEET) <= set(details):
         return None
-    return BodyFeet(*(details[name] for name in _DETAILS))
+    return BodyFeet(*(details[name] for name in DETAILS_OF_FEET))

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.estimates import check_estimates, frame_facts, to_tensor
@@ -275,6 +275,14 @@ class BodyTrack:
             names=self.names,
             fps=self.fps,
         )
+
+    def feet_seen_by(self, camera: PinholeCamera) -> Float[Tensor, "T 6 3"] | None:
+        """Return heels and toes in a camera's axes, metres; None where feet were not tracked."""
+        if self.feet is None:
+            return None
+        points = self.feet.points3d
+        R, t = (m.to(points) for m in (camera.rotation_matrix, camera.translation))
+        return points @ R.mT + t
 
     def _observed(self) -> Bool[Tensor, "T J"]:
         """Return which joints a camera measured: all of a silhouette, of keypoints those that are inliers."""

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.module_state import derived
-from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.body._articulation import Articulation
 from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._skeleton import BODY_15, other_side
 from torchpose.math._gaussian import safe_cholesky
@@ -44,10 +44,11 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     weigh,
 )
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses
 
-_ITERATIONS = 2
-_FOLLOWS = 1.0  # share of a change of what legs let expect that feet go along with at once
+_FOLLOWS = 0.5  # share of a change of what legs let expect that feet go along with at once
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
+_KNEES = tuple(BODY_15.parents[ankle] for ankle in ANKLES)
 _SHANKS = tuple(BODY_15.part_of[ankle] for ankle in ANKLES)
 
 
@@ -60,7 +61,7 @@ class FootGaussian(NamedTuple):
 
 
 class FootPoses(NamedTuple):
-    """Holds the feet of B persons; of T frames [B, T, ...], or of one [B, ...].
+    """Holds the feet of B persons, as `DETAILS_OF_FEET`; of T frames [B, T, ...], or of one [B, ...].
 
     Attributes:
         points: [..., 6, 3], of `FEET`, metres, world axes. covariance: [..., 6, 3, 3], metres squared.
@@ -98,9 +99,16 @@ class FootFilter(nn.Module):
         above = torch.tensor([[_carries(part, shank) for part in range(len(BODY_15.parts))]
                               for shank in _SHANKS])  # fmt: skip
         turns = above[:, articulation.axis_part].double()
-        self.register_buffer("_turns", turns, persistent=False)
+        axes = (3 * articulation.axis_part + articulation.axis).expand(len(_SHANKS), -1)
+        self.register_buffer("_unit", torch.eye(3, dtype=torch.float64), persistent=False)
+        self.register_buffer("_legs", torch.ones(1, len(FEET), dtype=torch.float64), persistent=False)
+        self.register_buffer("_axes", axes, persistent=False)
+        self.register_buffer("_turns", turns[..., None], persistent=False)
 
     _mirror: Tensor
+    _unit: Tensor
+    _legs: Tensor
+    _axes: Tensor
     _turns: Tensor
 
     @property
@@ -111,35 +119,21 @@ class FootFilter(nn.Module):
 
     # --- the legs ---------------------------------------------------------------------------------
 
-    def legs(
-        self,
-        point: BodyPoint,
-        state_cov: Float[Tensor, "*batch N N"],
-        covariance: Float[Tensor, "*batch J 3 3"],
-    ) -> Legs:
-        """Return what tracked bodies tell of their feet.
-
-        Args:
-            point: the bodies. state_cov: in their tangent spaces.
-            covariance: of the joints, as it is reported.
-        """
+    def legs(self, poses: KeypointPoses) -> Legs:
+        """Return what tracked bodies tell of their feet; errors of shanks and ankles count as independent."""
         a = self.articulation
-        joints, jacobian = a.linearise(point)
-        rotations = a.world_rotations(point)
-        axes = rotations.mT.flatten(-3, -2)[..., 3 * a.axis_part + a.axis, :].mT
-        by_turn = torch.zeros_like(jacobian[..., ANKLES, :, :])
-        by_turn[..., a.columns["rotations"]] = axes.unsqueeze(-3) * self._turns[:, None]
-        H = torch.cat([by_turn, jacobian[..., ANKLES, :, :]], -2)
-        cov = H @ state_cov.unsqueeze(-3) @ H.mT
-        parents = [BODY_15.parents[ankle] for ankle in ANKLES]
+        rotations = a.world_rotations(poses.point)
+        axes = rotations.mT.flatten(-3, -2)[..., self._axes, :] * self._turns
+        columns = a.columns["rotations"]
+        cov = axes.mT @ poses.state_cov[..., None, columns, columns] @ axes
+        of_ankle = poses.joint_cov[..., ANKLES, :, :]
+        roots = safe_cholesky(torch.stack([cov, of_ankle]))
+        ankle = poses.joints[..., ANKLES, :]
         return Legs(
-            joints[..., ANKLES, :],
-            rotations[..., _SHANKS, :, :],
-            self.prior.centre_at(a, point),
-            safe_cholesky((cov + cov.mT) / 2),
-            (joints[..., ANKLES, :] - joints[..., parents, :]).norm(dim=-1),
-            covariance[..., ANKLES, :, :] - cov[..., 3:, 3:],
-        )
+            ankle, rotations[..., _SHANKS, :, :], self.prior.centre(poses.point), roots[0], roots[1],
+            (ankle - poses.joints[..., _KNEES, :]).norm(dim=-1),
+            poses.covariance[..., ANKLES, :, :] - of_ankle,
+        )  # fmt: skip
 
     # --- one frame --------------------------------------------------------------------------------
 
@@ -160,10 +154,22 @@ class FootFilter(nn.Module):
             fresh: of whom nothing is known from the frame before.
         """
         state = self.predict(before, legs, fresh)
+        points, H = self.linearise(state.mean, legs)
+        HP = H @ state.cov
+        G = HP @ H.mT
         inlier = torch.zeros_like(frame.inlier)
         if bool((frame.inlier > 0).any()):
-            state, inlier = self._corrected(state, legs, frame, maps, beliefs)
-        return state, self.poses(state, legs, inlier)
+            exchange = Exchange(self._mirror, self._legs)
+            readings, seen = readings_of(frame, exchange), see(maps, points.flatten(1, 2))
+            spread = blocks_of(G).flatten(1, 2)
+            weighed = weigh(readings, seen, maps, beliefs, exchange, spread, marginal=True)
+            W, b = (value.unflatten(1, (2, 3)) for value in information(readings, seen, weighed))
+            step = information_step(H, HP, G, W, b, torch.zeros_like(state.mean))
+            UH, cov = step.U @ H.mT, state.cov - step.U.mT @ step.U
+            state = state._replace(mean=state.mean + step.step, cov=(cov + cov.mT) / 2)
+            points = points + (H @ step.step[..., None]).unflatten(-2, (3, 3)).squeeze(-1)
+            G, inlier = G - UH.mT @ UH, weighed.inlier
+        return state, self._poses(state, legs, points, blocks_of(G), inlier)
 
     def predict(
         self, before: FootGaussian | None, legs: Legs, fresh: Bool[Tensor, " B"]
@@ -192,42 +198,19 @@ class FootFilter(nn.Module):
         ahead[..., TURN] += (1 - _FOLLOWS) * (centre - after)
         return ahead
 
-    def _corrected(
-        self,
-        state: FootGaussian,
-        legs: Legs,
-        frame: KeypointFrame,
-        maps: RigMaps,
-        beliefs: Beliefs,
-    ) -> tuple[FootGaussian, Float[Tensor, "B C 6"]]:
-        """Return the posterior by steps of Gauss and Newton, and the probabilities of inliers."""
-        exchange = Exchange(self._mirror, torch.ones_like(frame.inlier[0, :1]))
-        readings = readings_of(frame, exchange)
-        d, cov = torch.zeros_like(state.mean), None
-        for _ in range(_ITERATIONS):
-            points, H = self.linearise(state.mean + d, legs)
-            HP = H @ state.cov
-            G = HP @ H.mT
-            seen = see(maps, points.flatten(1, 2))
-            spread = (blocks_of(G) if cov is None else cov).flatten(1, 2)
-            weighed = weigh(
-                readings, seen, maps, beliefs, exchange, spread, marginal=cov is None
-            )  # fmt: skip
-            W, b = (value.unflatten(1, (2, 3)) for value in information(readings, seen, weighed))
-            step = information_step(H, HP, G, W, b, d)
-            d, UH = step.step, step.U @ H.mT
-            cov = blocks_of(G - UH.mT @ UH)
-        after = state.cov - step.U.mT @ step.U
-        return state._replace(mean=state.mean + d, cov=(after + after.mT) / 2), weighed.inlier
-
     def poses(self, state: FootGaussian, legs: Legs, inlier: Tensor) -> FootPoses:
         """Return the feet of states."""
         points, H = self.linearise(state.mean, legs)
-        cov = blocks_of(H @ state.cov @ H.mT) + legs.more.unsqueeze(-3)
+        return self._poses(state, legs, points, blocks_of(H @ state.cov @ H.mT), inlier)
+
+    def _poses(
+        self, state: FootGaussian, legs: Legs, points: Tensor, cov: Tensor, inlier: Tensor
+    ) -> FootPoses:
+        """Return the feet of states with points [..., 2, 3, 3] that have a covariance [..., 2, 3, 3, 3]."""
         turn = exponential(cross_matrix(torch.stack([state.centre, state.mean[..., TURN]])))
         return FootPoses(
-            points.flatten(-3, -2), cov.flatten(-4, -3), inlier, turn[0] @ turn[1],
-            state.cov[..., TURN, TURN],
+            points.flatten(-3, -2), (cov + legs.more.unsqueeze(-3)).flatten(-4, -3), inlier,
+            turn[0] @ turn[1], state.cov[..., TURN, TURN],
         )  # fmt: skip
 
     def linearise(self, mean: Float[Tensor, "*batch 2 N"], legs: Legs) -> _Linearised:
@@ -237,23 +220,29 @@ class FootFilter(nn.Module):
         the exponential.
         """
         x = mean[..., TURN]
-        errors = (legs.root @ mean[..., ERRORS, None]).squeeze(-1)
-        skew = cross_matrix(torch.stack([errors[..., :3], legs.centre, x]))
+        turned, moved = mean[..., ERRORS].unflatten(-1, (2, 3)).unbind(-2)
+        skew = cross_matrix(torch.stack([_product(legs.turn_root, turned), legs.centre, x]))
         wrong, centre, turn = exponential(skew).unbind(0)
         R = wrong @ legs.shank @ centre @ turn
-        X = skew[2]
-        right = torch.eye(3).to(X) - X / 2 + X @ X / 6
+        X, eye = skew[2], self._unit
+        right = eye - X / 2 + X @ X / 6
         scaled = legs.length[..., None, None] * R
         levers = (self.motion.shape + mean[..., SHAPE].unflatten(-1, (3, 3))) @ scaled.mT
-        points = (legs.ankle + errors[..., 3:]).unsqueeze(-2) + levers
+        points = (legs.ankle + _product(legs.ankle_root, moved)).unsqueeze(-2) + levers
         across = -cross_matrix(levers)  # [..., 2, 3, 3, 3]
         by_turn = across @ (R @ right).unsqueeze(-3)
-        eye = torch.eye(3).to(X)
         by_shape = (eye[:, None, :, None] * scaled[..., None, :, None, :]).flatten(-2)
-        by_error = legs.root[..., None, 3:, :] + across @ legs.root[..., None, :3, :]
+        by_shank = across @ legs.turn_root.unsqueeze(-3)
+        by_ankle = legs.ankle_root.unsqueeze(-3).expand_as(by_turn)
         none = torch.zeros_like(by_turn)
-        jacobian = torch.cat([by_turn, none, by_shape, by_error], -1)
+        jacobian = torch.cat([by_turn, none, by_shape, by_shank, by_ankle], -1)
         return _Linearised(points, jacobian.flatten(-3, -2))
+
+
+def _product(
+    matrix: Float[Tensor, "*batch 3 3"], vector: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    return (matrix @ vector[..., None]).squeeze(-1)
 
 
 def exchanged_legs(

@@ -25,8 +25,8 @@ TURN, RATE, SHAPE, ERRORS = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 21
 N_FOOT = 21
 _SIZE_STD = 0.06  # of the log of a foot's size relative to the shank
 _SHAPE_STD = (0.03, 0.05, 0.04)  # lengths of the shank, outwards, upwards, forwards
-_SHAPE_TIME = 60.0  # seconds
-_ERROR_TIME = 0.2  # seconds
+_SHAPE_TIME = 5.0  # seconds, since toes bend
+_ERROR_TIME = 0.03  # seconds
 
 
 class FootMotion(NamedTuple):
@@ -78,14 +78,15 @@ class Legs(NamedTuple):
     Attributes:
         ankle: [..., 2, 3], metres. shank: [..., 2, 3, 3], world axes.
         centre: [..., 2, 3], expected rotation vectors of feet relative to shanks, radians.
-        root: [..., 2, 6, 6], Cholesky factor of the covariance of the shank's rotation (world axes) and the
-            ankle. length: [..., 2], of the shanks, metres. more: [..., 2, 3, 3], covariance of the ankle
-            that the filter of the body does not have.
+        turn_root, ankle_root: [..., 2, 3, 3], Cholesky factors of the covariances of the shank's rotation
+            and of the ankle, world axes. length: [..., 2], of the shanks, metres.
+        more: [..., 2, 3, 3], covariance of the ankle that frames do not average out.
     """
 
     ankle: Tensor
     shank: Tensor
     centre: Tensor
-    root: Tensor
+    turn_root: Tensor
+    ankle_root: Tensor
     length: Tensor
     more: Tensor

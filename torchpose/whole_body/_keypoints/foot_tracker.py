@@ -33,7 +33,7 @@ def step_feet(
         poses: of the bodies [B]. frame: keypoints [B, C, 6].
         fresh: of whom nothing is known from the frame before; by default those whose tracking begins.
     """
-    legs = filter.legs(poses.point, poses.state_cov, poses.covariance)
+    legs = filter.legs(poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
     fresh = poses.started if fresh is None else fresh
     return filter.advance(before, legs, frame, maps, beliefs, fresh)
@@ -52,7 +52,7 @@ def track_feet(
         filter: of feet. maps: of the cameras. poses: of the bodies [B, T], smoothed where feet are to be.
         frames: keypoints [B, T, C, 6]. smoothing: whether later frames count too.
     """
-    every = filter.legs(poses.point, poses.state_cov, poses.covariance)
+    every = filter.legs(poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
     state: FootGaussian | None = None
     states, found = [], []
@@ -110,9 +110,3 @@ def continued(
     same = now[:, None] == numbers
     rows = same.int().argmax(1)
     return mapped(lambda value: value[rows], before), ~same.any(1)
-
-
-def unknown_feet(feet: FootPoses) -> FootPoses:
-    """Return feet of which nothing is known: NaN, and no inliers."""
-    nothing: FootPoses = mapped(lambda value: torch.full_like(value, torch.nan), feet)
-    return nothing._replace(inlier=torch.zeros_like(feet.inlier))

@@ -25,7 +25,7 @@ from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeErro
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._foot_prior import shipped_foot_prior
 from torchpose.priors._shipped import load_body_motion
-from torchpose.whole_body._body_feet import ESTIMATES_OF_FEET, details_of_feet
+from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_notes import (
     doubt_cameras,
@@ -406,7 +406,8 @@ class KeypointBodyTracker(nn.Module):
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
         standing: dict[str, Tensor] = {}
         if feet is not None:
-            standing = details_of_feet(mapped(lambda value: value[b, begun:], feet))
+            own = mapped(lambda value: value[b, begun:], feet)
+            standing = dict(zip(DETAILS_OF_FEET, own, strict=True))
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
@@ -515,7 +516,7 @@ def _unknown(track: BodyTrack) -> BodyTrack:
     feet = {
         name: torch.full_like(value, torch.nan)
         for name, value in track.details.items()
-        if name in ESTIMATES_OF_FEET
+        if name in SIZES_OF_FEET
     }
     return replace(track, **values, details={**track.details, **feet})
 

@@ -82,7 +82,8 @@ class KeypointPoses(NamedTuple):
             where tracking began. alone: [...], which of several cameras alone decided, -1 if all did.
         turns: [..., C], radians by which keypoints of a camera were turned back. off: [..., C], which cameras
             counted not.
-        scale: [..., C], factors of the cameras' noise.
+        scale: [..., C], factors of the cameras' noise. joint_cov: [..., J, 3, 3], without what frames do not
+            average out, which `covariance` has on top.
     """
 
     joints: Tensor
@@ -98,6 +99,7 @@ class KeypointPoses(NamedTuple):
     turns: Tensor
     off: Tensor
     scale: Tensor
+    joint_cov: Tensor
 
 
 KeypointStep = tuple[KeypointStream, KeypointPoses, CorrectedBody]
@@ -226,7 +228,7 @@ class KeypointTracker(nn.Module):
             found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
-            stream.faults.angle, stream.faults.off, found.state.scale,
+            stream.faults.angle, stream.faults.off, found.state.scale, found.joint_cov,
         )  # fmt: skip
 
     def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:
@@ -466,8 +468,13 @@ class KeypointTracker(nn.Module):
         cov = result.cov.transpose(0, 1)
         joints, jacobian = self.filter.articulation.linearise(point)
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
-        joint_cov = self._unsure(joint_cov, joints, filtered.alone)
-        return filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
+        return filtered._replace(
+            joints=joints,
+            covariance=self._unsure(joint_cov, joints, filtered.alone),
+            point=point,
+            state_cov=cov,
+            joint_cov=joint_cov,
+        )
 
 
 def _sees_enough(there: Bool[Tensor, "B C J"]) -> Bool[Tensor, "B C"]:
