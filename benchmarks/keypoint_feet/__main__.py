@@ -1,6 +1,6 @@
 """Feet from keypoints of one to four cameras: a tracker beside a fixed foot and triangulation.
 
-The bodies, cameras and faults are those of `benchmarks.keypoint_bodies`, the first two seconds of each clip.
+The bodies, cameras and faults are those of `benchmarks.keypoint_bodies`, the first 80 frames of each clip.
 A detector finds big toes too, with the same faults: those are the only points of feet that motion capture
 has. Persons who are scored are not among those to whom the prior over feet was fitted. In the recording of
 Pose2Sim heels and toes of every real camera are predicted from the others.
@@ -26,7 +26,7 @@ from benchmarks.keypoint_feet.tables import add_real_table, add_table
 from torchpose.evaluation import Report
 
 _RIGS = (4, 2, 1)
-_FRAMES, _QUICK_FRAMES = 120, 15
+_FRAMES, _QUICK_FRAMES = 80, 15
 
 
 def main(

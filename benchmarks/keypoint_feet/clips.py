@@ -19,8 +19,8 @@ from benchmarks.keypoint_bodies import clips as bodies
 from benchmarks.keypoint_bodies.clips import FAULTS, Clip, Faults, bursts, recorded
 from benchmarks.keypoint_feet.fit import toes_of
 from torchpose.body import BODY_15
-from torchpose.io._mocap import MocapClip
 from torchpose.evaluation._trials import settings_hash
+from torchpose.io._mocap import MocapClip
 
 __all__ = ["TOES", "ToedClip", "begun", "read_toed"]
 

@@ -88,7 +88,10 @@ def _feet_of(clip: MocapClip, origin: str) -> list[_Feet]:
     state = fit_state(body, joints)
     n = len(state)
     rotations = quaternion_vector_to_matrix(state[:, 3:].unflatten(-1, (-1, 3)))
-    none = state.new_zeros(n, len(articulation.groups)), state.new_zeros(n, len(articulation.shifted), 3)
+    none = (
+        state.new_zeros(n, len(articulation.groups)),
+        state.new_zeros(n, len(articulation.shifted), 3),
+    )
     point = BodyPoint(state[:, :3], rotations, state.new_zeros(n, articulation.n_pose), *none)
     rates = clip.fps * torch.gradient(articulation.relative_angles(point), dim=0)[0]
     first = 3 + articulation.n_root

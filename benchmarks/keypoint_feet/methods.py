@@ -64,19 +64,19 @@ def estimates_of(
         confidence: 0 where missing. fps: frames per second.
     """
 
-    def track(trust: Tensor, smoothing: str = "none") -> BodyTrack:
-        tracker = BodyTracker(rig, method="kalman", fps=fps)
-        names = (*BODY_15.names, *FEET)
-        return tracker(keypoints=keypoints, confidence=trust, names=names, smoothing=smoothing)
-
+    tracker, names = BodyTracker(rig, method="kalman", fps=fps), (*BODY_15.names, *FEET)
     blind = confidence.clone()
     blind[..., _N_JOINTS:] = 0
-    filtered = track(confidence)
+    both = torch.stack([confidence, blind])
+    seen, alone = tracker(
+        keypoints=keypoints.expand(2, *keypoints.shape), confidence=both, names=names
+    )
+    smoothed = tracker(keypoints=keypoints, confidence=confidence, names=names, smoothing="full")
     found = {
-        "kalman": _tracked(filtered),
-        "kalman-smoothed": _tracked(track(confidence, "full")),
-        "kalman-legs-alone": _tracked(track(blind)),
-        FIXED: _fixed(filtered),
+        "kalman": _tracked(seen),
+        "kalman-smoothed": _tracked(smoothed),
+        "kalman-legs-alone": _tracked(alone),
+        FIXED: _fixed(seen),
     }
     if len(rig) > 1:
         own = keypoints[:, :, _N_JOINTS:], confidence[:, :, _N_JOINTS:]

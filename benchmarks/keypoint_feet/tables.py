@@ -31,8 +31,8 @@ _MEASURES = ("all", "from the ankle", "seldom seen", "50 %", "90 %")
 _SURE = 0.5  # confidence from which a keypoint of the camera left out counts
 _PELVIS = BODY_15.joint("pelvis")
 _NOTE = (
-    "Mean over clips; a method marked * has seen no later frame. 'from the ankle': error of the line from the "
-    "ankle to the toe. '50 %' and '90 %': share of true toes inside of the ellipsoids. "
+    "Mean over clips; a method marked * has seen no later frame. 'from the ankle': error of the line from "
+    "the ankle to the toe. '50 %' and '90 %': share of true toes inside of the ellipsoids. "
 )
 
 
@@ -133,9 +133,7 @@ def add_real_table(report: Report, data: Path, frames: int | None = None) -> Non
         for name, estimate in found.items():
             off = (filmed.rig(estimate.points).pixels - pixels).norm(dim=-1)[:, others]
             errors[name][len(rows)].append(off[trust[:, others] > _SURE])
-    columns = [
-        f"{n} camera{'s' * (n > 1)}, {what}" for n in counts for what in ("median", "90 %")
-    ]
+    columns = [f"{n} camera{'s' * (n > 1)}, {what}" for n in counts for what in ("median", "90 %")]
     result = report.table(
         "real", "Heels and toes in a real camera, predicted from others (pixels)", columns,
         note="All cameras left out and all choices of the others. A method marked * has seen no later frame.",

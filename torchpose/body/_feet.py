@@ -34,7 +34,10 @@ _SPELLINGS = {  # canonical names that may stand for a point, the best one first
     "big_toe": ("big_toe", "foot_index", "toe", "foot"),
     "small_toe": ("small_toe",),
 }
-_BIG_TOE, _SMALL_TOE = -0.03, (0.07, 0.8)  # of the shank to the outside; share of the big toe's distance
+_BIG_TOE, _SMALL_TOE = (
+    -0.03,
+    (0.07, 0.8),
+)  # of the shank to the outside; share of the big toe's distance
 
 
 def foot_points(
@@ -42,8 +45,8 @@ def foot_points(
 ) -> Float[Tensor, "*batch 6 C"] | None:
     """Pick the points of feet, `FEET`, out of a joint set.
 
-    MediaPipe's foot_index, the toe of motion capture and the foot of a Kinect, in sets that have an ankle too,
-    stand for the big toe.
+    MediaPipe's foot_index, the toe of motion capture and the foot of a Kinect, in sets that have an ankle
+    too, stand for the big toe.
 
     Args:
         points: [..., K, C]. names: the K names.

@@ -278,7 +278,7 @@ def _read(
 def _of_body(
     source: str, points: Tensor, confidence: Tensor | None, names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
-    """Return keypoints [..., 15, 2] and confidence [..., 15] of the joints of `BODY_15`, and of feet if it has any.
+    """Return keypoints [..., 15, 2] and confidence [..., 15] of the joints of `BODY_15`, and of feet.
 
     Heads and necks that were put where the prior of the upper body has them are none of this body.
     """

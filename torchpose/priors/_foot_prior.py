@@ -17,7 +17,10 @@ from torchpose.body._skeleton import other_side
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "feet" / "whole-body.safetensors"
 _LEG = ("left_thigh", "left_shank", "right_thigh", "right_shank")
-_PLUS, _MINUS = {0: 7, 2: 3}, {0: 5, 2: 1}  # entries R32 - R23 and R21 - R12 of a matrix by its axis
+_PLUS, _MINUS = (
+    {0: 7, 2: 3},
+    {0: 5, 2: 1},
+)  # entries R32 - R23 and R21 - R12 of a matrix by its axis
 _FARTHEST = 3.0  # standard deviations, beyond which angles and rates count no more
 
 
@@ -55,8 +58,9 @@ class FootPrior(nn.Module):
     """Holds a prior over the rotation of feet relative to their shanks.
 
     The rotation vector of a left foot is m + A^T f + x. The features f are the turns of both legs (sines of
-    angles times axes) and their rates, over their standard deviations. What is left, x, is a critically damped process about zero along
-    each axis, with covariance s^2 (1 + r t) exp(-r t) over the time t. A right foot is the mirror image.
+    angles times axes) and their rates, over their standard deviations. What is left, x, is a critically
+    damped process about zero along each axis, with covariance s^2 (1 + r t) exp(-r t) over
+    the time t. A right foot is the mirror image.
 
     Args:
         feature_mean, feature_std: [F], of the features. slope: A [F, 3]. mean: m [3], radians.
@@ -126,7 +130,7 @@ def shipped_foot_prior() -> FootPrior:
 
 
 class LegTurns(nn.Module):
-    """Computes how both legs are turned and turn, as each foot sees it: its own leg first, the right in a mirror.
+    """Computes how both legs are turned, and how fast: each foot has its own leg first, the right is mirrored.
 
     Args:
         articulation: of the bodies.

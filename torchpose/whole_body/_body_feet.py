@@ -9,7 +9,13 @@ from torch import Tensor
 
 from torchpose.body._feet import FEET
 
-DETAILS_OF_FEET = ("feet", "feet_covariance", "feet_inlier", "foot_rotation", "foot_rotation_covariance")
+DETAILS_OF_FEET = (
+    "feet",
+    "feet_covariance",
+    "feet_inlier",
+    "foot_rotation",
+    "foot_rotation_covariance",
+)
 """Names of the details of a track that hold feet."""
 SIZES_OF_FEET = {
     "feet": (6, 3), "feet_covariance": (6, 3, 3), "foot_rotation": (2, 3, 3),

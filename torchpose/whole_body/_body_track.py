@@ -105,7 +105,7 @@ class BodyTrack:
 
     @property
     def feet(self) -> BodyFeet | None:
-        """Return heels and toes with their covariances, and the ankles; None where no keypoint was of a foot."""
+        """Return heels and toes with their covariances, and the ankles; None without keypoints of feet."""
         return feet_of(self.details)
 
     @property
@@ -238,8 +238,9 @@ class BodyTrack:
         """Write the poses for other programs: ``.trc`` (OpenSim), ``.c3d`` or ``.bvh``, by the suffix.
 
         TRC and C3D hold `joints3d` as markers with the names of Pose2Sim (RHip, LKnee, CHip, ...), in
-        metres and in millimetres, and heels and toes where `feet` are there; the residuals of C3D are standard
-        deviations. BVH holds the rigid body that `state` turns, in centimetres. A frame rate that is not known is written as 30.
+        metres and in millimetres, and heels and toes if there are `feet`; the residuals of C3D are standard
+        deviations. BVH holds the rigid body that `state` turns, in centimetres. A frame rate that is not
+        known is written as 30.
 
         Args:
             path: the file, which is replaced if there is one.

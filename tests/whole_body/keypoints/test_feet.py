@@ -273,7 +273,9 @@ def test_feet_of_another_size_are_refused(tmp_path, tracked):
     path = tmp_path / "body.npz"
     details = {**tracked.details, "feet": tracked.details["feet"][:, :5]}
     BodyTrack(**{**vars(tracked), "details": details}).save(path)
-    with pytest.raises(FileFormatError, match=r"detail_feet of the sizes \[30, 6, 3\], got \[30, 5"):
+    with pytest.raises(
+        FileFormatError, match=r"detail_feet of the sizes \[30, 6, 3\], got \[30, 5"
+    ):
         BodyTrack.load(path)
 
 
@@ -348,6 +350,8 @@ def test_the_right_foot_is_the_mirror_image_of_the_left():
     angles, rates = torch.randn(2, body.n_rotations, generator=generator, dtype=torch.float64)
     mirror = mirror_of(body)
     whole = prior.centre(angles[body.n_root :], rates[body.n_root :])
-    flipped = prior.centre(*((v[mirror.columns] * mirror.sign)[body.n_root :] for v in (angles, rates)))
+    flipped = prior.centre(
+        *((v[mirror.columns] * mirror.sign)[body.n_root :] for v in (angles, rates))
+    )
     sides = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     assert_close(flipped, whole.flip(0) * sides)

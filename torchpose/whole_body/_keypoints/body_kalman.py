@@ -310,7 +310,9 @@ class BodyKalmanFilter(nn.Module):
         )  # fmt: skip
         return _Linearised(H, HP, G, seen, weighed)
 
-    def _step(self, readings: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]) -> InformationStep:
+    def _step(
+        self, readings: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]
+    ) -> InformationStep:
         """Return one step of Gauss and Newton from the prediction."""
         H, HP, G, seen, weighed = found
         return information_step(H, HP, G, *information(readings, seen, weighed), d)

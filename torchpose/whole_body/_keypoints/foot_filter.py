@@ -89,11 +89,14 @@ class FootFilter(nn.Module):
 
     Args:
         articulation: of the bodies. prior: over feet. fps: frames per second.
+        doubt: factor on the standard deviations of shanks and ankles as the bodies were tracked.
     """
 
-    def __init__(self, articulation: Articulation, prior: FootPrior, fps: float) -> None:
+    def __init__(
+        self, articulation: Articulation, prior: FootPrior, fps: float, doubt: float = 1.0
+    ) -> None:
         super().__init__()
-        self.articulation, self.prior, self.fps = articulation, prior, fps
+        self.articulation, self.prior, self.fps, self.doubt = articulation, prior, fps, doubt
         mirror = torch.tensor([FEET.index(other_side(name)) for name in FEET])
         self.register_buffer("_mirror", mirror, persistent=False)
         above = torch.tensor([[_carries(part, shank) for part in range(len(BODY_15.parts))]
@@ -101,7 +104,9 @@ class FootFilter(nn.Module):
         turns = above[:, articulation.axis_part].double()
         axes = (3 * articulation.axis_part + articulation.axis).expand(len(_SHANKS), -1)
         self.register_buffer("_unit", torch.eye(3, dtype=torch.float64), persistent=False)
-        self.register_buffer("_legs", torch.ones(1, len(FEET), dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "_legs", torch.ones(1, len(FEET), dtype=torch.float64), persistent=False
+        )
         self.register_buffer("_axes", axes, persistent=False)
         self.register_buffer("_turns", turns[..., None], persistent=False)
 
@@ -127,7 +132,7 @@ class FootFilter(nn.Module):
         columns = a.columns["rotations"]
         cov = axes.mT @ poses.state_cov[..., None, columns, columns] @ axes
         of_ankle = poses.joint_cov[..., ANKLES, :, :]
-        roots = safe_cholesky(torch.stack([cov, of_ankle]))
+        roots = self.doubt * safe_cholesky(torch.stack([cov, of_ankle]))
         ankle = poses.joints[..., ANKLES, :]
         return Legs(
             ankle, rotations[..., _SHANKS, :, :], self.prior.centre(poses.point), roots[0], roots[1],
@@ -216,8 +221,8 @@ class FootFilter(nn.Module):
     def linearise(self, mean: Float[Tensor, "*batch 2 N"], legs: Legs) -> _Linearised:
         """Return the points of feet and their derivative.
 
-        A turn of the foot by x changes p by -[r]x R J(x), with the lever r = p - a and the right Jacobian J of
-        the exponential.
+        A turn of the foot by x changes p by -[r]x R J(x), with the lever r from the ankle to p and the right
+        Jacobian J of the exponential.
         """
         x = mean[..., TURN]
         turned, moved = mean[..., ERRORS].unflatten(-1, (2, 3)).unbind(-2)

@@ -26,7 +26,7 @@ N_FOOT = 21
 _SIZE_STD = 0.06  # of the log of a foot's size relative to the shank
 _SHAPE_STD = (0.03, 0.05, 0.04)  # lengths of the shank, outwards, upwards, forwards
 _SHAPE_TIME = 5.0  # seconds, since toes bend
-_ERROR_TIME = 0.03  # seconds
+_ERROR_TIME = 0.1  # seconds
 
 
 class FootMotion(NamedTuple):

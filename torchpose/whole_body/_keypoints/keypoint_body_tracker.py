@@ -73,6 +73,7 @@ PIXEL_STD = 1.0
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
+_DOUBT_OF_LEGS = 2.0  # of several cameras, in which toes are seen well and a body may be astray
 _LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
 
 
@@ -130,7 +131,10 @@ class KeypointBodyTracker(nn.Module):
             rig, self.fps, motion, up=up, lasting_std=lasting,
             lone=LoneNoise((std_of_one / self.keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
         )  # fmt: skip
-        self.feet = FootFilter(motion.articulation, copy.deepcopy(shipped_foot_prior()), self.fps)
+        self.feet = FootFilter(
+            motion.articulation, copy.deepcopy(shipped_foot_prior()), self.fps,
+            doubt=1.0 if alone else _DOUBT_OF_LEGS,
+        )  # fmt: skip
 
     @property
     def rig(self) -> CameraRig:
@@ -169,8 +173,11 @@ class KeypointBodyTracker(nn.Module):
         check_units(self.tracker.filter, frames)
         begun = self.first_frames(frames)
         if refine != "none":
-            from_begun = (None if x is None else x.map(lambda v: v[:, begun[0] :]) for x in (frames, feet))
-            return self._refined_track(*from_begun, refine, smoothing == "full", progress, begun[0])
+            frames = frames.map(lambda value: value[:, begun[0] :])
+            feet = None if feet is None else feet.map(lambda value: value[:, begun[0] :])
+            return self._refined_track(
+                frames, feet, refine, smoothing == "full", progress, begun[0]
+            )
         poses = self.tracker(frames, smoothing == "full", progress)
         found = self.feet_of(poses, feet, smoothing == "full")
         tracks = [
@@ -200,9 +207,7 @@ class KeypointBodyTracker(nn.Module):
         found = None
         if feet is not None:
             feet = feet.map(lambda value: value[None])
-            standing, found = step_feet(
-                self.feet, standing, self.tracker.filter.maps, pose, feet
-            )
+            standing, found = step_feet(self.feet, standing, self.tracker.filter.maps, pose, feet)
             found = with_time(found)
         frames = frame.map(lambda value: value[:, None])
         track = self.track(with_time(pose), frames, 0, summed_up=False, feet=found)

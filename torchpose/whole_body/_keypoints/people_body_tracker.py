@@ -162,9 +162,7 @@ class PeopleBodyTracker:
         covariance: Tensor | None,
     ) -> tuple[KeypointFrame, KeypointFrame | None]:
         """Return the detections of bodies and of feet as frames [..., D, C, J]."""
-        trust, cov = (
-            None if v is None else v.transpose(-3, -2) for v in (confidence, covariance)
-        )
+        trust, cov = (None if v is None else v.transpose(-3, -2) for v in (confidence, covariance))
         both = self.single.frames_and_feet(keypoints.transpose(-4, -3), trust, names, cov)
         body, feet = (
             one if one is None or one.inlier.shape[-3] else _with_an_empty_one(one) for one in both
