@@ -18,6 +18,7 @@ OF_DATA_SETS = (
     "hand_network",
     "keypoint_bodies",
     "keypoint_cameras",
+    "keypoint_feet",
     "keypoint_people",
     "mediapipe_front_end",
     "real_bends",

@@ -163,6 +163,33 @@ def test_poses_from_all_kinds_of_files(track, scene, tmp_path):
     assert not (out / "body.trc").exists() and not (out / "skeleton.png").exists()
 
 
+def test_feet_of_files_are_in_the_table_and_in_all_formats(torchpose, scene, tmp_path):
+    folder, joints = scene[:2]
+    cameras = CameraRig(list(load_cameras(folder / "cameras.toml").values()))
+    toes = joints[:, BODY_15.joint("left_ankle")] + torch.tensor([0.0, 0.15, -0.08]).double()
+    pixels = cameras(torch.cat([joints, toes[:, None]], 1)).pixels
+    given = [tmp_path / f"{camera}.npz" for camera in cameras.names]
+    for c, path in enumerate(given):
+        write_keypoints(path, Keypoints(pixels[:, c], (*BODY_15.names, "left_big_toe"), fps=FPS))
+    out = tmp_path / "out"
+    options = ("--out", out, "--formats", "trc", "bvh")
+    done = torchpose("track-body", folder / "cameras.toml", *given, *options)
+    assert done.code == 0, done.err
+    poses = BodyTrack.load(out / "body.npz")
+    assert poses.feet is not None
+    assert float((poses.feet.points3d[5:, 1] - toes[5:]).norm(dim=-1).mean()) < 0.03
+    head, *rows = (row.split(",") for row in (out / "joints.csv").read_text().splitlines())
+    assert head.index("left_heel_x") == 1 + 4 * 15
+    assert head[-7:] == [*(f"{side}_ankle_{a}" for side in ("left", "right")
+                           for a in ("flexion", "inversion", "rotation")), "coasting"]  # fmt: skip
+    column = head.index("left_big_toe_x")
+    found = [float(v) for v in rows[-1][column : column + 3]]
+    assert found == pytest.approx(poses.feet.points3d[-1, 1].tolist(), abs=1e-3)
+    assert "LBigToe" in (out / "body.trc").read_text()
+    assert "left_foot" in (out / "body.bvh").read_text()
+    assert "left big toe" in (out / "report.html").read_text()
+
+
 def test_one_camera_is_enough(track, scene, tmp_path):
     given = ("--camera-names", "front", "--height", 1.75, *PLAIN)  # as well as [front]
     done = track(tmp_path, "front.npz", *given)

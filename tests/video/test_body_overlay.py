@@ -51,6 +51,16 @@ def test_silhouettes_of_another_scale_cover_their_place():
     assert not outlined[90, 110]
 
 
+def test_feet_are_drawn_below_the_ankles_in_the_colours_of_their_sides():
+    frame = np.full((120, 160, 3), 90, np.uint8)
+    left = torch.tensor([[96.0, 114.0], [130.0, 116.0], [126.0, 112.0]])
+    feet = torch.cat([left, torch.full((3, 2), torch.nan)])
+    drawn = draw_body(frame, joints(), feet=feet)
+    toe = drawn[116, 130].astype(int)
+    assert toe[2] > toe[0] + 80  # blue
+    assert (drawn == draw_body(frame, joints())).all(-1)[:, :60].all()  # the right one is not known
+
+
 def test_keypoints_are_yellow_crosses():
     frame = np.full((120, 160, 3), 90, np.uint8)
     nobody = torch.full((15, 2), torch.nan, dtype=torch.float64)

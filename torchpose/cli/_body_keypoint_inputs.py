@@ -295,7 +295,8 @@ def _of_body(
     except SkeletonError as error:
         raise SkeletonError(f"{source}: {error}") from error
     feet = foot_points(table, names[:given])
-    joints = joints if feet is None else torch.cat([joints, feet], -2)
+    if feet is not None and bool(feet.isfinite().any()):
+        joints = torch.cat([joints, feet], -2)
     return joints[..., :2], joints[..., 2].nan_to_num(0.0)
 
 

@@ -307,9 +307,10 @@ def _write_skeleton(path: "Path", poses: "BodyTrack", camera: "PinholeCamera") -
     from torchpose.viz._style import save_figure
 
     seen = poses.seen_by(camera)
+    joints, feet = seen.joints3d[0].tensor_split([len(poses.names)], 1)
     figure = plot_body_strip(
-        seen.joints3d[0], poses.body.skeleton, fps=poses.fps or 30.0,
-        first_frame=poses.first_frame, observed=seen.observed[0], feet=poses.feet_seen_by(camera),
+        joints, poses.body.skeleton, fps=poses.fps or 30.0, first_frame=poses.first_frame,
+        observed=seen.observed[0], feet=feet if poses.feet is not None else None,
     )  # fmt: skip
     return save_figure(figure, path)
 

@@ -264,10 +264,12 @@ def write_page(
     camera: "PinholeCamera", people: "Sequence[BodyTrack]", facts: dict[str, str], out: Path
 ) -> list[Path]:
     """Write the page with the first camera's overlay, if there is one, the skeletons and curves."""
+    from torchpose.body._feet import FOOT_BONES
     from torchpose.viz._report.page import write_report
 
     overlay = out / _overlay_name(camera.name)
     bones = [(p, j) for j, p in enumerate(people[0].body.skeleton.parents) if p >= 0]
+    bones += FOOT_BONES if people[0].feet is not None else ()
     first, end = _span(people)
     late = [f"frame 0 of this page is frame {first} of the recording"] if first else []
     page = write_report(

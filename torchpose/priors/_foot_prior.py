@@ -130,7 +130,7 @@ def shipped_foot_prior() -> FootPrior:
 
 
 class LegTurns(nn.Module):
-    """Computes how both legs are turned, and how fast: each foot has its own leg first, the right is mirrored.
+    """Computes how both legs are turned, and how fast; each foot has its own leg first, the right mirrored.
 
     Args:
         articulation: of the bodies.

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
-from torchpose.body._feet import ANKLES, FEET, FOOT_BONES
+from torchpose.body._feet import FEET, FOOT_BONES
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.viz._skeletons import (
     _choose_frames,
@@ -55,8 +55,8 @@ def plot_body_strip(
     Args:
         joints: camera axes, metres. skeleton: whose joints they are.
         n_frames: number of frames to draw, spread over all. fps: frames per second, for the times above.
-        first_frame: number of the first frame. observed: True = measured; the other joints are hollow.
-        feet: heels and toes of a body of fifteen joints, in the same axes, if they were tracked.
+        first_frame: number of the first frame. feet: heels and toes of a body of fifteen joints, in the same
+            axes, if they were tracked. observed: True = measured, of joints and feet; others are hollow.
 
     Raises:
         ShapeError: joints of another shape. InputError: no frame.
@@ -68,8 +68,6 @@ def plot_body_strip(
     if feet is not None:
         joints, names = torch.cat([joints, feet.to(joints)], 1), (*names, *FEET)
         limbs += FOOT_BONES
-        if observed is not None:
-            observed = torch.cat([observed, observed[:, [a for a in ANKLES for _ in range(3)]]], 1)
     frames = _choose_frames(None, n_frames, len(joints))
     centred = joints - joints[:, :1]
     low, high = _limits(centred[frames], margin=0.06)

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchpose._core.estimates import check_estimates, frame_facts, to_tensor
@@ -257,7 +257,7 @@ class BodyTrack:
         write_body_file(path, motion, up)
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
-        """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`.
+        """Return the joints in a camera's axes, and those of feet, for `torchpose.viz._report.write_report`.
 
         Args:
             camera: with a pose in the room.
@@ -265,25 +265,25 @@ class BodyTrack:
         Returns:
             `CameraPoses`: joints [1, T, J, 3], metres, their covariances [1, T, J, 3, 3], square metres, and
             which of them were observed [1, T, J]: all where a camera saw the person; of keypoints
-            (``details["inlier"]``) those of which a camera's was the joint's with more than 1/2.
+            (``details["inlier"]``) those of which a camera's was the joint's with more than 1/2. Those of
+            `feet` follow.
         """
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
+        points, covariance, observed = self.joints3d, self.covariance3d, self._observed()
+        names, feet = self.names, self.feet
+        if feet is not None:
+            points = torch.cat([points, feet.points3d.to(points)], 1)
+            covariance = torch.cat([covariance, feet.covariance3d.to(covariance)], 1)
+            observed = torch.cat([observed, (feet.inlier > 0.5).any(1)], 1)
+            names = (*names, *feet.names)
         return CameraPoses(
-            joints3d=(self.joints3d @ R.mT + t)[None],
-            covariance3d=(R @ self.covariance3d @ R.mT)[None],
-            observed=self._observed()[None],
+            joints3d=(points @ R.mT + t)[None],
+            covariance3d=(R @ covariance @ R.mT)[None],
+            observed=observed[None],
             failed_at=torch.full((1,), -1),
-            names=self.names,
+            names=names,
             fps=self.fps,
         )
-
-    def feet_seen_by(self, camera: PinholeCamera) -> Float[Tensor, "T 6 3"] | None:
-        """Return heels and toes in a camera's axes, metres; None where feet were not tracked."""
-        if self.feet is None:
-            return None
-        points = self.feet.points3d
-        R, t = (m.to(points) for m in (camera.rotation_matrix, camera.translation))
-        return points @ R.mT + t
 
     def _observed(self) -> Bool[Tensor, "T J"]:
         """Return which joints a camera measured: all of a silhouette, of keypoints those that are inliers."""
