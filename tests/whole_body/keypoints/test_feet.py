@@ -9,8 +9,10 @@ from torch.testing import assert_close
 from tests.whole_body.keypoints.scenes import FPS, NAMES, ring, scene
 from torchpose import BodyTracker
 from torchpose.body import BODY_15
+from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.body._feet import ANKLES, FEET, foot_points, foot_shape
 from torchpose.errors import FileFormatError
+from torchpose.learning._body_motion_fit import mirror_of
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.metrics import coverage
 from torchpose.priors._foot_prior import shipped_foot_prior
@@ -315,7 +317,7 @@ def test_derivatives_of_feet_are_those_of_differences(tracked):
     shown = scene(2, 1)
     frame = tracker.frames(shown.keypoints, None, NAMES, None)
     _, pose, _ = tracker.tracker.advance(None, frame)
-    legs = filter.legs(pose.point, pose.state_cov, pose.covariance)
+    legs = filter.legs(pose)
     mean = 0.1 * torch.randn(1, 2, N_FOOT, generator=generator, dtype=torch.float64)
     found = filter.linearise(mean, legs)
     step = 1e-6
@@ -325,12 +327,30 @@ def test_derivatives_of_feet_are_those_of_differences(tracked):
         slope = (filter.linearise(moved, legs).points - found.points) / step
         own = found.jacobian[..., column].unflatten(-1, (3, 3))
         assert_close(slope, own, atol=2e-3, rtol=0)
-    # errors of the body: the ankle and the shank move with its state as the factor says
-    assert_close(
-        (legs.root @ legs.root.mT)[..., 3:, 3:] + legs.more, pose.covariance[:, ANKLES],
-        atol=1e-9, rtol=0,
-    )  # fmt: skip
+    of_ankle = legs.ankle_root @ legs.ankle_root.mT / filter.doubt**2
+    assert_close(of_ankle + legs.more, pose.covariance[:, ANKLES], atol=1e-9, rtol=0)
     assert body.articulation is filter.articulation
+
+
+def test_the_rotation_of_a_shank_is_as_unsure_as_its_joints_say():
+    tracker = BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints
+    frame = tracker.frames(scene(2, 1).keypoints, None, NAMES, None)
+    _, pose, _ = tracker.tracker.advance(None, frame)
+    filter, body = tracker.feet, tracker.tracker.filter.articulation
+    legs = filter.legs(pose)
+    step = 1e-6
+    shanks = [BODY_15.part_of[ankle] for ankle in ANKLES]
+    slopes = []
+    for column in range(body.dim):
+        d = torch.zeros(1, body.dim, dtype=torch.float64)
+        d[:, column] = step
+        turned = body.world_rotations(body.moved(pose.point, d))[:, shanks]
+        skew = (turned @ legs.shank.mT - torch.eye(3, dtype=torch.float64)) / step
+        slopes.append(torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1))
+    H = torch.stack(slopes, -1)
+    expected = H @ pose.state_cov[:, None] @ H.mT
+    found = legs.turn_root @ legs.turn_root.mT / filter.doubt**2
+    assert_close(found, expected, atol=1e-7, rtol=1e-4)
 
 
 def test_a_foot_that_is_not_measured_stays_with_its_prior():
@@ -341,17 +361,19 @@ def test_a_foot_that_is_not_measured_stays_with_its_prior():
 
 
 def test_the_right_foot_is_the_mirror_image_of_the_left():
-    prior = shipped_foot_prior()
-    from torchpose.body._articulation import Articulation
-    from torchpose.learning._body_motion_fit import mirror_of
-
-    body = Articulation()
+    prior, body = shipped_foot_prior(), Articulation()
     generator = torch.Generator().manual_seed(0)
-    angles, rates = torch.randn(2, body.n_rotations, generator=generator, dtype=torch.float64)
+    angles, rates = 0.5 * torch.randn(2, body.n_rotations, generator=generator, dtype=torch.float64)
     mirror = mirror_of(body)
-    whole = prior.centre(angles[body.n_root :], rates[body.n_root :])
-    flipped = prior.centre(
-        *((v[mirror.columns] * mirror.sign)[body.n_root :] for v in (angles, rates))
-    )
-    sides = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    assert_close(flipped, whole.flip(0) * sides)
+
+    def centre(angles, rates):
+        vectors = torch.zeros(len(BODY_15.parts), 3, dtype=torch.float64)
+        vectors[body.axis_part, body.axis] = angles
+        velocity = torch.cat([torch.zeros(3, dtype=torch.float64), rates])
+        none = torch.zeros(0, dtype=torch.float64)
+        return prior.centre(BodyPoint(none, rotvec_to_matrix(vectors), velocity, none, none))
+
+    whole = centre(angles, rates)
+    flipped = centre(*(v[mirror.columns] * mirror.sign for v in (angles, rates)))
+    assert_close(flipped, whole.flip(0) * torch.tensor([1.0, -1.0, -1.0]).double())
+    assert float((whole[0] - whole[1]).abs().max()) > 0.01
