@@ -165,6 +165,15 @@ def _other(name):
     return f"{'right' if side == 'left' else 'left'}_{kind}"
 
 
+def test_a_camera_without_the_body_tells_nothing_of_feet(four):
+    shown, _, keypoints = four
+    elsewhere = keypoints.clone()
+    elsewhere[:, 3, :15] = torch.nan
+    found = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=elsewhere, names=WITH_FEET)
+    assert bool((found.feet.inlier[:, 3] == 0).all())
+    assert float(found.feet.inlier[:, :3].mean()) > 0.9
+
+
 def test_a_batch_gives_each_its_own_feet(four, tracked):
     shown, _, keypoints = four
     other = torch.cat([shown.keypoints[:10], with_feet(seed=5, n_frames=10)[2][:, :, 15:]], 2)

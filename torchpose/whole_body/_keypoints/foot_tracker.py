@@ -36,7 +36,13 @@ def step_feet(
     legs = filter.legs(poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
     fresh = poses.started if fresh is None else fresh
-    return filter.advance(before, legs, frame, maps, beliefs, fresh)
+    return filter.advance(before, legs, trusted(frame, poses), maps, beliefs, fresh)
+
+
+def trusted(frame: KeypointFrame, poses: KeypointPoses) -> KeypointFrame:
+    """Return keypoints of feet in the cameras that are right, and see the body where it was found."""
+    wrong = poses.off | (poses.turns != 0) | ~(poses.inlier > 0.5).any(-1)
+    return frame._replace(inlier=frame.inlier.masked_fill(wrong[..., None], 0.0))
 
 
 def track_feet(
@@ -54,6 +60,7 @@ def track_feet(
     """
     every = filter.legs(poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
+    frames = trusted(frames, poses)
     state: FootGaussian | None = None
     states, found = [], []
     for t in range(poses.started.shape[1]):
