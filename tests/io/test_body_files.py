@@ -83,7 +83,7 @@ def test_c3d(tmp_path, up):
     track = track_of()
     track.export(tmp_path / "body.c3d", up=up)
     found = parse_c3d(tmp_path / "body.c3d")
-    assert found.parameters["POINT:LABELS"] == list(marker_names(BODY_15))
+    assert found.parameters["POINT:LABELS"] == list(marker_names(BODY_15.names))
     assert found.parameters["POINT:UNITS"] == ["mm"]
     assert (found.parameters["POINT:USED"], found.parameters["POINT:FRAMES"]) == (15, T)
     assert found.parameters["POINT:RATE"] == found.rate == FPS
