@@ -123,7 +123,7 @@ def train_frames(
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     frames = torch.cat(poses)
-    n, epochs = (5_000, 5) if quick else (100_000, 40)
+    n, epochs = (2_000, 2) if quick else (100_000, 40)
     chosen = frames[torch.randint(len(frames), (n,), generator=generator)]
     x, y = examples(chosen[:, None], targets, generator, names)
     x, y = x[:, 0], y[:, 0]
@@ -157,7 +157,7 @@ def train_sequences(
         place = torch.minimum(first.long()[:, None] + torch.arange(64), lengths[row][:, None] - 1)
         return examples(stacked[row[:, None], place], targets, generator, names)
 
-    fit(model, batch, 40 if quick else 1_500, "GRU, both directions" if both else "GRU")
+    fit(model, batch, 10 if quick else 1_500, "GRU, both directions" if both else "GRU")
     return model
 
 

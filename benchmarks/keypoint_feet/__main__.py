@@ -26,7 +26,7 @@ from benchmarks.keypoint_feet.tables import add_real_table, add_table
 from torchpose.evaluation import Report
 
 _RIGS = (4, 2, 1)
-_FRAMES, _QUICK_FRAMES = 80, 15
+_FRAMES, _QUICK_FRAMES = 80, 10
 
 
 def main(
