@@ -250,6 +250,20 @@ def test_a_foot_without_an_ankle_is_the_ankle_of_the_body():
 # --- angles ---------------------------------------------------------------------------------------
 
 
+def test_feet_in_a_camera_that_is_turned_count_as_its_body_does():
+    shown, feet, keypoints = with_feet(cameras=3)
+    rig = ring(3)
+    turn = rotvec_to_matrix(torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64))
+    rig.rotation[1] = turn @ rig.rotation[1]
+    rig.translation[1] = turn @ rig.translation[1]
+    alone = keypoints.clone()
+    alone[:, [0, 2], 15:] = torch.nan  # feet are seen by the turned camera alone
+    found = BodyTracker(rig, "kalman", fps=FPS)(keypoints=alone, names=WITH_FEET)
+    assert any("seems to be turned" in note for note in found.notes)
+    assert float(found.feet.inlier[10:, 1].mean()) > 0.8
+    assert float(errors(found, feet)[10:].mean()) < 60
+
+
 def feet_turned(turn):
     """Feet that are both turned by the same rotation vector."""
     rotation = rotvec_to_matrix(torch.tensor(turn, dtype=torch.float64)).expand(1, 2, 3, 3)

@@ -30,7 +30,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 )
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.nested import mapped, taken
-from torchpose.whole_body._keypoints.turned_cameras import find_turns, turned
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, turned
 
 LEAST_CAMERAS = 3
 LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
@@ -64,14 +64,6 @@ class CameraFaults(NamedTuple):
     back: Tensor
     pixels: Tensor
     inlier: Tensor
-
-    @property
-    def angle(self) -> Float[Tensor, "B C"]:
-        """Return by how much cameras are turned, radians."""
-        if not bool(self.wrong.any()):
-            return torch.zeros_like(self.back)
-        cosine = (self.turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-        return cosine.clamp(-1, 1).arccos()
 
     @classmethod
     def none(cls, frame: KeypointFrame) -> Self:
@@ -126,7 +118,7 @@ def find_faults(
     unexplained = (given.inlier > 0) & tried.off[..., None]
     nobody = (unexplained * filter.maps.log_area[:, None]).sum((-2, -1))
     evidence = found.log_evidence - nobody - price
-    refused = _enough(right) & _few_or_wide(found, right) | (tried.angle > _FARTHEST_TURN)
+    refused = _enough(right) & _few_or_wide(found, right) | (angles_of(tried.turn) > _FARTHEST_TURN)
     evidence = torch.where(refused.any(-1), -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
     better = evidence.amax(-1) > plain.log_evidence + _LEAST_GAIN

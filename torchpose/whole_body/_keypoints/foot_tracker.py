@@ -16,6 +16,7 @@ from torchpose.whole_body._keypoints.foot_filter import (
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses, stacked
 from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.turned_cameras import turned
 
 
 def step_feet(
@@ -36,13 +37,19 @@ def step_feet(
     legs = filter.legs(poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
     fresh = poses.started if fresh is None else fresh
-    return filter.advance(before, legs, trusted(frame, poses), maps, beliefs, fresh)
+    seen = _as_bodies_saw(frame, poses, maps)
+    return filter.advance(before, legs, seen, maps, beliefs, fresh)
 
 
-def trusted(frame: KeypointFrame, poses: KeypointPoses) -> KeypointFrame:
-    """Return keypoints of feet in the cameras that are right, and see the body where it was found."""
-    wrong = poses.off | (poses.turns != 0) | ~(poses.inlier > 0.5).any(-1)
-    return frame._replace(inlier=frame.inlier.masked_fill(wrong[..., None], 0.0))
+def _as_bodies_saw(frame: KeypointFrame, poses: KeypointPoses, maps: RigMaps) -> KeypointFrame:
+    """Return keypoints of feet in the cameras that see the body, turned back as those of the body were."""
+    wrong = poses.off | ~(poses.inlier > 0.5).any(-1)
+    frame = frame._replace(inlier=frame.inlier.masked_fill(wrong[..., None], 0.0))
+    is_turned = (poses.turn != torch.eye(3).to(poses.turn)).flatten(-2).any(-1)
+    if not bool(is_turned.any()):
+        return frame
+    pixels = turned(frame, poses.turn, maps).pixels
+    return frame._replace(pixels=torch.where(is_turned[..., None, None], pixels, frame.pixels))
 
 
 def track_feet(
@@ -60,7 +67,7 @@ def track_feet(
     """
     every = filter.legs(poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
-    frames = trusted(frames, poses)
+    frames = _as_bodies_saw(frames, poses, maps)
     state: FootGaussian | None = None
     states, found = [], []
     for t in range(poses.started.shape[1]):

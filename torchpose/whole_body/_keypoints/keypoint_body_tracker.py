@@ -62,6 +62,7 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
 from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.turned_cameras import angles_of
 
 T = TypeVar("T")
 KEYPOINT_METHOD = "kalman"
@@ -462,7 +463,7 @@ class KeypointBodyTracker(nn.Module):
             self.sized, first_frame,
         )  # fmt: skip
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
-        turned = notes_on_turned_cameras(self.rig.names, poses.turns, first_frame)
+        turned = notes_on_turned_cameras(self.rig.names, angles_of(poses.turn), first_frame)
         notes += notes_on_left_out_cameras(self.rig.names, poses.off, first_frame) + turned
         if len(self.rig) == 1 and self.tracker.filter.up is None:
             rolled = notes_on_a_rolled_camera(self.rig.names[0], frame.pixels[:, 0], there[:, 0])

@@ -80,8 +80,8 @@ class KeypointPoses(NamedTuple):
         inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of
             arms, of legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...],
             where tracking began. alone: [...], which of several cameras alone decided, -1 if all did.
-        turns: [..., C], radians by which keypoints of a camera were turned back. off: [..., C], which cameras
-            counted not.
+        turn: [..., C, 3, 3], rotation in world axes by which keypoints of a camera were turned back.
+        off: [..., C], which cameras counted not.
         scale: [..., C], factors of the cameras' noise. joint_cov: [..., J, 3, 3], without what frames do not
             average out, which `covariance` has on top.
     """
@@ -96,7 +96,7 @@ class KeypointPoses(NamedTuple):
     coasting: Tensor
     started: Tensor
     alone: Tensor
-    turns: Tensor
+    turn: Tensor
     off: Tensor
     scale: Tensor
     joint_cov: Tensor
@@ -228,7 +228,7 @@ class KeypointTracker(nn.Module):
             found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
-            stream.faults.angle, stream.faults.off, found.state.scale, found.joint_cov,
+            stream.faults.turn, stream.faults.off, found.state.scale, found.joint_cov,
         )  # fmt: skip
 
     def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:
@@ -341,7 +341,7 @@ class KeypointTracker(nn.Module):
             inlier=into_all(torch.zeros_like(pose.inlier), one.inlier, camera),
             exchanged=into_all(pose.exchanged, one.exchanged, camera),
             alone=alone,
-            turns=pose.turns,
+            turn=pose.turn,
             off=pose.off,
             scale=state.scale,
         )

@@ -39,13 +39,21 @@ class Turns(NamedTuple):
     price: Tensor
 
 
-def turned(frame: KeypointFrame, turn: Float[Tensor, "B C 3 3"], maps: RigMaps) -> KeypointFrame:
-    """Return keypoints as cameras would see them that are not turned.
+def turned(
+    frame: KeypointFrame, turn: Float[Tensor, "*batch C 3 3"], maps: RigMaps
+) -> KeypointFrame:
+    """Return keypoints [..., C, J] as cameras would see them that are not turned.
 
     Args:
         frame: the keypoints. turn: of the cameras, in world axes. maps: the cameras.
     """
     return frame._replace(pixels=_pixels(_rays(frame, maps) @ turn.mT, maps)[0])
+
+
+def angles_of(turn: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Return the angles of rotations, radians from 0 to pi."""
+    cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return cosine.clamp(-1, 1).arccos()
 
 
 def find_turns(frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps) -> Turns:
@@ -115,7 +123,7 @@ def _equations(
     return chol, F, b, S, g
 
 
-def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "N C J 3"]:
+def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "*batch C J 3"]:
     """Return the rays of keypoints in world axes, of depth 1."""
     ones = torch.ones_like(frame.pixels[..., :1])
     homogeneous = torch.cat([frame.pixels, ones], -1)
@@ -123,8 +131,8 @@ def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "N C J 3"]:
 
 
 def _pixels(
-    rays: Float[Tensor, "N C J 3"], maps: RigMaps
-) -> tuple[Float[Tensor, "N C J 2"], Float[Tensor, "N C J 2 3"]]:
+    rays: Float[Tensor, "*batch C J 3"], maps: RigMaps
+) -> tuple[Float[Tensor, "*batch C J 2"], Float[Tensor, "*batch C J 2 3"]]:
     """Return the pixels of rays, and their derivatives."""
     homogeneous = rays @ maps.matrix.mT
     depth = homogeneous[..., 2:]
