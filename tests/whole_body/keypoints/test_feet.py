@@ -251,7 +251,7 @@ def test_a_foot_without_an_ankle_is_the_ankle_of_the_body():
 
 
 def test_feet_in_a_camera_that_is_turned_count_as_its_body_does():
-    shown, feet, keypoints = with_feet(cameras=3)
+    _, feet, keypoints = with_feet(cameras=3)
     rig = ring(3)
     turn = rotvec_to_matrix(torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64))
     rig.rotation[1] = turn @ rig.rotation[1]
