@@ -93,5 +93,5 @@ def test_quick_run_prints_every_method(run_here, tmp_path):
         data_dir_or_skip(name)
     options = ("--data", str(data), "--out", str(tmp_path), "--threads", "1")
     printed = run_here("keypoint_feet.__main__", "--quick", *options)
-    assert printed.count("| fixed-foot * |") == 4
-    assert printed.count("| pose2sim |") == 3
+    assert printed.count("| fixed-foot * |") == 3
+    assert printed.count("| pose2sim |") == 2
