@@ -34,10 +34,8 @@ _SPELLINGS = {  # canonical names that may stand for a point, the best one first
     "big_toe": ("big_toe", "foot_index", "toe", "foot"),
     "small_toe": ("small_toe",),
 }
-_BIG_TOE, _SMALL_TOE = (
-    -0.03,
-    (0.07, 0.8),
-)  # of the shank to the outside; share of the big toe's distance
+# Of the shank to the outside; of the small toe also the share of the big toe's distance.
+_BIG_TOE, _SMALL_TOE = -0.03, (0.07, 0.8)
 
 
 def foot_points(

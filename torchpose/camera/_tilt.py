@@ -17,9 +17,8 @@ LARGEST_PITCH = math.radians(60.0)
 """Radians, beyond which a camera sees persons from above or below as no prior does."""
 
 _LEVEL = 1e-9  # by which a direction may be off the one that points up in a level camera
-_LEAST_COSINE = (
-    0.1  # between a ray and the optical axis of the level camera; beyond it has no pixel
-)
+# Between a ray and the optical axis of the level camera; beyond it has no pixel.
+_LEAST_COSINE = 0.1
 
 
 def up_of_angles(pitch: float, roll: float = 0.0) -> tuple[float, float, float]:

@@ -17,10 +17,8 @@ from torchpose.body._skeleton import other_side
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "feet" / "whole-body.safetensors"
 _LEG = ("left_thigh", "left_shank", "right_thigh", "right_shank")
-_PLUS, _MINUS = (
-    {0: 7, 2: 3},
-    {0: 5, 2: 1},
-)  # entries R32 - R23 and R21 - R12 of a matrix by its axis
+# Entries R32 - R23 and R21 - R12 of a matrix, by its axis.
+_PLUS, _MINUS = {0: 7, 2: 3}, {0: 5, 2: 1}
 _FARTHEST = 3.0  # standard deviations, beyond which angles and rates count no more
 
 

@@ -30,7 +30,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 )
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.nested import mapped, taken
-from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, turned
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, is_turned, turned
 
 LEAST_CAMERAS = 3
 LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
@@ -204,8 +204,8 @@ def with_returned(
     sees = _enough(frame) & (weighed.inlier.sum(-1) >= FEW_INLIERS * frame.inlier.sum(-1))
     back = torch.where(faults.off & sees, faults.back + 1, 0.0)
     off = faults.off & (back <= _RETURN * filter.fps)
-    straight = (faults.turn == torch.eye(3).to(faults.turn)).flatten(1).all(-1)
-    return faults._replace(off=off, back=back, wrong=off.any(-1) | ~straight)
+    wrong = (off | is_turned(faults.turn)).any(-1)
+    return faults._replace(off=off, back=back, wrong=wrong)
 
 
 def _enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:

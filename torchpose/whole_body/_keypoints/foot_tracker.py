@@ -16,7 +16,7 @@ from torchpose.whole_body._keypoints.foot_filter import (
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses, stacked
 from torchpose.whole_body._keypoints.nested import mapped
-from torchpose.whole_body._keypoints.turned_cameras import turned
+from torchpose.whole_body._keypoints.turned_cameras import is_turned, turned
 
 
 def step_feet(
@@ -45,11 +45,11 @@ def _as_bodies_saw(frame: KeypointFrame, poses: KeypointPoses, maps: RigMaps) ->
     """Return keypoints of feet in the cameras that see the body, turned back as those of the body were."""
     wrong = poses.off | ~(poses.inlier > 0.5).any(-1)
     frame = frame._replace(inlier=frame.inlier.masked_fill(wrong[..., None], 0.0))
-    is_turned = (poses.turn != torch.eye(3).to(poses.turn)).flatten(-2).any(-1)
-    if not bool(is_turned.any()):
+    back = is_turned(poses.turn)
+    if not bool(back.any()):
         return frame
     pixels = turned(frame, poses.turn, maps).pixels
-    return frame._replace(pixels=torch.where(is_turned[..., None, None], pixels, frame.pixels))
+    return frame._replace(pixels=torch.where(back[..., None, None], pixels, frame.pixels))
 
 
 def track_feet(

@@ -50,6 +50,11 @@ def turned(
     return frame._replace(pixels=_pixels(_rays(frame, maps) @ turn.mT, maps)[0])
 
 
+def is_turned(turn: Float[Tensor, "*batch 3 3"]) -> Bool[Tensor, "*batch"]:
+    """Return which rotations are not the unit matrix."""
+    return (turn != torch.eye(3).to(turn)).flatten(-2).any(-1)
+
+
 def angles_of(turn: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Return the angles of rotations, radians from 0 to pi."""
     cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
