@@ -12,6 +12,8 @@ import torch
 import torchpose
 from tests.pretended_device import PRETENDED, moved, pretended_device
 from tests.whole_body.keypoints.scenes import FPS, NAMES, scene
+from tests.whole_body.keypoints.test_faulty_cameras import with_turn
+from tests.whole_body.keypoints.test_feet import WITH_FEET, with_feet
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
@@ -139,6 +141,26 @@ def test_whole_bodies(cameras, device):
 
 
 @pytest.mark.parametrize("device", [pytest.param("cuda", marks=NEEDS_CUDA)])
+def test_feet_and_a_camera_that_is_turned(device):
+    seen, _, keypoints = with_feet(3, 22)
+    rig = with_turn(seen.rig, 1, 20.0)
+    given = {"keypoints": keypoints, "names": WITH_FEET}
+    here = torchpose.BodyTracker(rig, "kalman", fps=FPS)(**given)
+    with use_of(device):
+        tracker = moved(torchpose.BodyTracker(rig, "kalman", fps=FPS), device)
+        there = tracker(**given)
+        state = tracker.init()
+        for points in keypoints:
+            state, pose = tracker.step(state, keypoints=points, names=WITH_FEET)
+        feet, joints = there.feet.points3d.cpu(), there.joints3d.cpu()
+        last = pose.feet.points3d.reshape(6, 3).cpu()
+    assert there.notes == here.notes
+    torch.testing.assert_close(joints, here.joints3d, rtol=0, atol=METRE)
+    torch.testing.assert_close(feet, here.feet.points3d, rtol=0, atol=METRE)
+    torch.testing.assert_close(last, here.feet.points3d[-1], rtol=0, atol=METRE)
+
+
+@pytest.mark.parametrize("device", [pytest.param("cuda", marks=NEEDS_CUDA)])
 def test_a_whole_body_that_one_of_several_cameras_sees(device):
     seen = scene(2, 4, noise=2.0)
     seen.keypoints[:3, 1] = torch.nan
@@ -169,6 +191,7 @@ def test_several_persons(device):
     with use_of(device):
         (person,) = body_tracker(seen, device)(**given)
         assert person.joints3d.device.type == device
+        assert {each.device.type for each in person.details.values()} == {device}
 
 
 @pytest.fixture(scope="module")

@@ -108,6 +108,12 @@ def test_what_is_no_direction_is_refused(up, says):
         PinholeCamera(525, 525, 320, 240, up=up)
 
 
+@pytest.mark.parametrize("angles", [(-20.0, 0.0), (0.1, 5.0)])
+def test_angles_in_degrees_are_refused(angles):
+    with pytest.raises(CameraError, match=r"math\.radians"):
+        CAMERA.tilted(*angles)
+
+
 def test_options_state_where_up_is():
     assert held_camera(CAMERA, None, None, None, None) is CAMERA
     tilted = held_camera(CAMERA, -15.0, None, None, None)

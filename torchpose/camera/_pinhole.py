@@ -4,6 +4,7 @@ Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions 
 `torchpose.camera._projection` and `torchpose.math._rotations`.
 """
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -222,15 +223,21 @@ class PinholeCamera(nn.Module):
             A copy with `up` = (-sin r cos p, -cos r cos p, sin p).
 
         Raises:
-            CameraError: angles that are not finite, or a pitch of more than 60 degrees.
+            CameraError: angles that are not finite, a roll of more than pi, as an angle in degrees would be,
+                or a pitch of more than pi / 3, 60 degrees.
 
         >>> import math
         >>> camera = PinholeCamera(525, 525, 319.5, 239.5).tilted(math.radians(30))
         >>> round(float(camera.up[2]), 3)
         0.5
         """
-        angles = _vector("pitch and roll", [pitch, roll], 2).tolist()
-        return self._with_up(up_of_angles(*angles))
+        pitch, roll = _vector("pitch and roll", [pitch, roll], 2).tolist()
+        if abs(pitch) > math.pi / 2 or abs(roll) > math.pi:
+            raise CameraError(
+                f"pitch = {pitch:g} and roll = {roll:g} radians are more than pi / 2 and pi; angles in "
+                "degrees need math.radians(angle)"
+            )
+        return self._with_up(up_of_angles(pitch, roll))
 
     def with_world_up(self, axis: str) -> Self:
         """Return the camera of a calibrated rig with the orientation against gravity that its rotation says.

@@ -231,7 +231,7 @@ class PeopleBodyTracker:
             poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet
         )
         track.details["detection"] = torch.cat([one.detection for one in found])
-        track.details["person"] = torch.full((len(rows),), person)
+        track.details["person"] = track.details["detection"].new_full((len(rows),), person)
         return track
 
 
