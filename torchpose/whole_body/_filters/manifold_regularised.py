@@ -1,6 +1,6 @@
 """Run the manifold-regularised particle filter."""
 
-from typing import Any, Protocol, Unpack, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Unpack, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,9 +36,10 @@ class PoseManifold(Protocol):
         std_latent: sigma x->z [d]. std_step: sigma x->x [Q]. std_pose: sigma z->x [Q].
     """
 
-    std_latent: Tensor
-    std_step: Tensor
-    std_pose: Tensor
+    if TYPE_CHECKING:  # from Python 3.12 on, checks at run time do not find the buffers of a module
+        std_latent: Tensor
+        std_step: Tensor
+        std_pose: Tensor
 
     def to_latent(self, x: Tensor) -> Tensor: ...
 
