@@ -1,7 +1,17 @@
 """Arms of strangers, by trackers and by elementary geometry: `python -m benchmarks.bones`."""
 
 from benchmarks.bones.fits import SETS, fit_without
-from benchmarks.bones.scoring import Chains, errors, lifted, lifts, tracked, trackers, true_lengths
+from benchmarks.bones.scoring import (
+    Chains,
+    errors,
+    lifted,
+    lifts,
+    limbs,
+    poses_of,
+    tracked,
+    trackers,
+    true_lengths,
+)
 from benchmarks.bones.tables import FEW, FIT, FOUR
 from benchmarks.bones.views import (
     ENDS,
@@ -28,8 +38,10 @@ __all__ = [
     "fit_without",
     "lifted",
     "lifts",
+    "limbs",
     "mhad_views",
     "openpose_views",
+    "poses_of",
     "recordings",
     "seen_by_camera",
     "tracked",

@@ -40,12 +40,24 @@ def tracked(
         options: of the tracker.
     """
     poses = poses_of(view, prior, chosen, **options)
+    bones = poses.joints3d[0][:, ENDS].diff(dim=2)
+    inside = coverage(*limbs(view, poses)).overall.tolist()
+    return Chains(bones[:, :, 0], bones[:, :, 1], inside)
+
+
+def limbs(
+    view: View, poses: torchpose.PoseTrack
+) -> tuple[Float[Tensor, "T 4 3"], Float[Tensor, "T 4 3 3"], Float[Tensor, "T 4 3"]]:
+    """Return elbows and wrists from the middle of the shoulders, their covariances, and the true ones.
+
+    Args:
+        view: what is seen. poses: of a tracker.
+    """
     ends = poses.joints3d[0][:, ENDS]
     covariance = poses.covariance3d[0][:, ENDS]
     found, true = (x - x[:, :, :1].mean(1, keepdim=True) for x in (ends, view.truth))
-    parts = (x[:, :, 1:].flatten(1, 2) for x in (found, covariance, true))
-    bones = ends.diff(dim=2)
-    return Chains(bones[:, :, 0], bones[:, :, 1], coverage(*parts).overall.tolist())
+    found, covariance, true = (x[:, :, 1:].flatten(1, 2) for x in (found, covariance, true))
+    return found, covariance, true
 
 
 def poses_of(

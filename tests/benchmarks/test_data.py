@@ -27,6 +27,7 @@ OF_DATA_SETS = (
     "speed.gplvm",
     "speed.streamed_em",
     "ub_people_levers",
+    "unseen_levels",
     "unseen_sets",
     "video_asl_hands",
     "video_asl_joints",
