@@ -47,7 +47,7 @@ Distances = Sequence[Float[Tensor, " N"]]
 
 
 def distances(unseen: Unseen, method: str, few: bool, every: int) -> Distances:
-    """Return those of a method.
+    """Return the squared distances of a method on each recording of a set.
 
     Args:
         unseen: a set that is left out. method: its name. few: whether neck, hands and head alone are
@@ -71,7 +71,7 @@ def add_table(report: Report, title: str, sets: dict[str, Distances]) -> None:
     nominal = torch.tensor(LEVELS, dtype=torch.float64)
     bounds = chi2_quantile(nominal)
     table = report.table(title, title, _COLUMNS, digits=_DIGITS)
-    # logs: the mean radius is that of the sets' factors
+    # averaged as logs, since sets differ by factors
     needed = {name: torch.cat([*d]).quantile(nominal).log() for name, d in sets.items()}
     for name, recordings in sets.items():
         others = [radii for other, radii in needed.items() if other != name]
