@@ -9,12 +9,13 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
 
     python -m benchmarks.keypoint_bodies --data DIR [--out FILE] [--methods NAME ...] [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --noise-alone --methods kalman kalman-smoothed pose2sim
+    python -m benchmarks.keypoint_bodies --data DIR --heights [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
-The second line shows what noise costs by itself, in several cameras. The third prints what the constants
-of the filters of single joints were chosen by. The fourth fits the network that comes with torchpose and
-lifts the keypoints of one camera.
+The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
+is. The fourth prints what the constants of the filters of single joints were chosen by. The fifth fits the
+network that comes with torchpose and lifts the keypoints of one camera.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import torch
 
 from benchmarks._command import OneOf, run_command
 from benchmarks._table_file import TableFile, save_text
+from benchmarks.keypoint_bodies.camera_heights import add_height_table, height_of_kinect
 from benchmarks.keypoint_bodies.choosing import add_choices
 from benchmarks.keypoint_bodies.clips import (
     CHOOSING,
@@ -37,18 +39,20 @@ from benchmarks.keypoint_bodies.clips import (
     OTHER_KINECT,
     RIGS,
     SCORED,
+    Clip,
     begun,
     read_clips,
     read_kinect,
 )
 from benchmarks.keypoint_bodies.lifting import fit_shipped
-from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, Method, methods_of
+from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, Method, methods_of, takes
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.tables import add_table
 from torchpose.evaluation import Report
 
 _ALL = (*METHODS, *LIFTERS)
 _KINECT_TITLE = "One camera, persons of a Kinect (mm)"
+_KINECT_HEIGHT_TITLE = "One camera of known height, persons of a Kinect (mm)"
 _OTHER_TITLE = "One camera, a person of another Kinect (mm)"
 
 
@@ -60,6 +64,7 @@ def main(
     threads: int = 2,
     out: TableFile | None = None,
     noise_alone: bool = False,
+    heights: bool = False,
     choose: bool = False,
     fit: Path | None = None,
     quick: bool = False,
@@ -73,6 +78,7 @@ def main(
         threads: cores.
         out: file for the same as Markdown, or a folder.
         noise_alone: whether keypoints have noise and nothing else, in several cameras only.
+        heights: whether one camera is told how high it is, in place of the tables.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
@@ -90,6 +96,13 @@ def main(
         clips = {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
     if choose:
         add_choices(report, clips)
+    elif heights:
+        chosen = {
+            name: one
+            for name, one in methods_of(methods, data, lifters, quick).items()
+            if takes(name, 1)
+        }
+        _add_heights(report, chosen, clips, data, quick)
     else:
         chosen = methods_of(methods, data, lifters, quick)
         for cameras in (count for count in RIGS if count > 1 or not noise_alone):
@@ -99,6 +112,21 @@ def main(
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
     save_text(out, "\n\n".join(tables) + "\n")
+
+
+def _add_heights(
+    report: Report,
+    methods: Mapping[str, Method],
+    clips: Mapping[str, Sequence[Clip]],
+    data: Path,
+    quick: bool,
+) -> None:
+    """Add the tables of one camera whose height is known."""
+    rings = [clip.of_cameras(1) for group in clips.values() for clip in group]
+    add_height_table(report, methods, rings, "One camera of known height (mm)")
+    kinect = read_kinect(data, KINECT_SCORED[:1] if quick else KINECT_SCORED)
+    height = height_of_kinect(data)
+    add_height_table(report, methods, kinect, _KINECT_HEIGHT_TITLE, height)
 
 
 def _add_recorded_views(

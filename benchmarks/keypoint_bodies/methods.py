@@ -38,7 +38,10 @@ def track(
     poses = tracker(
         keypoints=keypoints, confidence=confidence, names=BODY_15.names, smoothing=smoothing
     )
-    values = (poses.joints3d, poses.covariance3d)
+    covariance = poses.covariance3d
+    if len(rig) == 1:  # errors are relative to the pelvis there
+        covariance = poses.details["covariance_from_pelvis"]
+    values = (poses.joints3d, covariance)
     return Estimate(*(from_the_start(value, poses.first_frame) for value in values))
 
 

@@ -13,6 +13,7 @@ from torchpose.body import BODY_15
 from torchpose.metrics import align, coverage, jitter, joint_errors
 
 _PELVIS = BODY_15.joint("pelvis")
+_OTHERS = [joint for joint in range(len(BODY_15.names)) if joint != _PELVIS]
 _BONES = [(joint, parent) for joint, parent in enumerate(BODY_15.parents) if parent >= 0]
 
 
@@ -21,7 +22,7 @@ class Estimate(NamedTuple):
 
     Attributes:
         joints: [T, 15, 3], metres, NaN where it has none; of one camera perhaps only relative to the
-            pelvis. covariance: [T, 15, 3, 3], None where it says none.
+            pelvis. covariance: [T, 15, 3, 3], of one camera relative to the pelvis, None where it says none.
     """
 
     joints: Tensor
@@ -42,8 +43,9 @@ class Score(NamedTuple):
         unseen: error of joints that fewer than two cameras see; of one camera, that it does not see.
         exchanged: error of joints whose sides are exchanged in a camera.
         jitter: mean acceleration over that of the truth. inside_50, inside_90: shares of true joints
-            in the ellipsoids, %. bones: standard deviation of the bones' lengths over time, % of their
-            mean. true_bones: that of the truth. without: share of joints without a result, %.
+            in the ellipsoids, %, of one camera without the pelvis. bones: standard deviation of the bones'
+            lengths over time, % of their mean. true_bones: that of the truth. without: share of joints
+            without a result, %.
     """
 
     error: float
@@ -74,7 +76,10 @@ def score(estimate: Estimate, clip: Clip) -> Score:
     unseen = clip.cameras_that_see < min(2, len(clip.rig))
     half, most = torch.nan, torch.nan
     if estimate.covariance is not None:
-        half, most = (100 * coverage(joints, estimate.covariance, truth).overall).tolist()
+        given = joints, estimate.covariance, truth
+        if len(clip.rig) == 1:
+            given = tuple(value[:, _OTHERS] for value in given)
+        half, most = (100 * coverage(*given).overall).tolist()
     return Score(
         _mean(errors),
         1000 * _mean(joint_errors(rigid, truth)),

@@ -91,14 +91,14 @@ def _score(estimate: FootEstimate, clip: ToedClip) -> _Score:
     """Return the measures of an estimate."""
     toes, truth, body = estimate.points[:, _POINTS], clip.toes, clip.body.joints
     away, half, most = torch.nan, torch.nan, torch.nan
+    if estimate.covariance is not None:
+        inside = coverage(toes, estimate.covariance[:, _POINTS], truth).overall
+        half, most = (100 * inside).tolist()
     if estimate.joints is not None:
         lines = toes - estimate.joints[:, ANKLES], truth - body[:, ANKLES]
         away = _mean(lines[0] - lines[1])
         if len(clip.body.rig) == 1:
             toes = toes + body[:, [_PELVIS]] - estimate.joints[:, [_PELVIS]]
-    if estimate.covariance is not None:
-        inside = coverage(toes, estimate.covariance[:, _POINTS], truth).overall
-        half, most = (100 * inside).tolist()
     unseen = clip.clean.sum(1) < min(2, len(clip.body.rig))
     return _Score(_mean(toes - truth), away, _mean((toes - truth)[unseen]), half, most)
 

@@ -16,7 +16,7 @@ from torchpose.errors import InputError
 
 _METAVARS = {
     "action": "NAME|FILE", "actions": "ACTION", "arms": "FILE", "body": "FILE",
-    "bone_lengths": "NAME=M,...", "camera": "FILE|fx,fy,cx,cy", "camera_name": "NAME",
+    "bone_lengths": "NAME=M,...", "camera": "FILE|fx,fy,cx,cy", "camera_height": "M", "camera_name": "NAME",
     "camera_names": "NAME,...", "components": "K", "conditionals": "NAME|FILE",
     "delays": "[n,n,...]", "face_model": "FILE",
     "facing": "[x,y,z]", "fps": "HZ", "height": "M", "held_out": "PERSON",

@@ -57,7 +57,7 @@ PYTHON_ONLY = frozenset({
 """Options of the shipped filters that only Python has: what the papers' experiments vary."""
 _HOW_SILHOUETTES = ("background", "ignore_still", "rows", "sharpness")
 _OF_PARTICLES = ("initial_pose", "manifold", "conditionals", "action", "n_particles")
-_OF_KALMAN = ("smoothing", "refine", "persons", "motion")
+_OF_KALMAN = ("smoothing", "refine", "persons", "motion", "camera_height")
 _OF_KEYPOINTS = (
     *_OF_KALMAN, "videos", "silhouettes", "keypoint_std", "pixel_std", "min_confidence"
 )  # fmt: skip
@@ -274,7 +274,7 @@ def _run_on_keypoints(
         detector = DetectorSettings(values["detector"], values["min_confidence"])
     arguments = tracker
     if not _of_particles(values["method"]):
-        names = ("body", "height", "keypoint_std", "pixel_std", "motion")
+        names = ("body", "height", "keypoint_std", "pixel_std", "motion", "camera_height")
         arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
     outlines = None
     if values["silhouettes"]:

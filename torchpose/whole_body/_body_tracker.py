@@ -113,6 +113,8 @@ class BodyTracker(nn.Module):
             fit body`; in Python also the `BodyMotion` itself.
         up: of "kalman", "y" or "z", the axis of the world that points up; people are then expected upright.
             By default one camera is taken to be about level, and of several nothing is expected.
+        camera_height: of "kalman", the height of the only camera above the floor, metres, by which feet on
+            the floor tell the size of the person and the distance; needs `up`.
         **options: the options of the method's filter (`torchpose.whole_body._filter_table.method_options`),
             such as sharpness, limits, leg_swap or n_layers.
 
@@ -161,6 +163,7 @@ class BodyTracker(nn.Module):
         pixel_std: float | None = None,
         motion: BodyMotion | str | Path | None = None,
         up: str | None = None,
+        camera_height: float | None = None,
         **options: Unpack[BodyTrackerOptions],
     ) -> None:
         super().__init__()
@@ -182,10 +185,11 @@ class BodyTracker(nn.Module):
             self.by_keypoints = KeypointBodyTracker(
                 rig, fps, body=person, height=height,
                 motion=load_body_motion(motion) if isinstance(motion, str | Path) else motion,
-                keypoint_std=keypoint_std, pixel_std=pixel_std, up=up,
+                keypoint_std=keypoint_std, pixel_std=pixel_std, up=up, camera_height=camera_height,
             )  # fmt: skip
             return
-        unused = [name for name, value in (("motion", motion), ("up", up)) if value is not None]
+        of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
+        unused = [name for name, value in of_kalman.items() if value is not None]
         _refuse(unused, f"without method={KEYPOINT_METHOD!r}")
         height = _HEIGHT if height is None else height
         self.method = choose_method(method, given)

@@ -31,7 +31,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     RigMaps,
     see,
 )
-from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 
 REFINED = ("none", "delays", "extrinsics", "both")
 DELAY = N_ERRORS - 1

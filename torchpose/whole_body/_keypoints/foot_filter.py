@@ -44,7 +44,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     weigh,
 )
-from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 
 _FOLLOWS = 0.5  # share of a change of what legs let expect that feet go along with at once
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite

@@ -14,7 +14,8 @@ from torchpose.whole_body._keypoints.foot_filter import (
     exchanged_legs,
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
-from torchpose.whole_body._keypoints.keypoint_tracker import KeypointPoses, stacked
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
+from torchpose.whole_body._keypoints.keypoint_tracker import stacked
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turned_cameras import is_turned, turned
 

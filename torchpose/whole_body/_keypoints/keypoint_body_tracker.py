@@ -16,6 +16,7 @@ from torchpose._core.checks import (
     check_height,
     check_positive,
     check_shape,
+    number_of,
 )
 from torchpose.body._feet import ANKLES, FEET, foot_points
 from torchpose.body._kinematics import Body
@@ -53,13 +54,14 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_still_cameras,
     notes_on_turned_cameras,
 )
-from torchpose.whole_body._keypoints.keypoint_tracker import (
-    LEAST_JOINTS,
-    KeypointPoses,
-    KeypointStream,
-    KeypointTracker,
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
+from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS, KeypointTracker
+from torchpose.whole_body._keypoints.known_person import (
+    of_one_camera,
+    std_of_legs,
+    with_body,
+    with_height,
 )
-from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turned_cameras import angles_of
@@ -74,6 +76,9 @@ PIXEL_STD = 1.0
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
+COVARIANCE_FROM_PELVIS = "covariance_from_pelvis"
+"""Name of the detail of one camera."""
+_HIGHEST_CAMERA = 30.0  # metres above the floor
 _DOUBT_OF_LEGS = 2.0  # of several cameras, in which toes are seen well and a body may be astray
 _LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
 
@@ -94,9 +99,10 @@ class KeypointBodyTracker(nn.Module):
         keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
         pixel_std: pixels, how far they are apart from that; None is the usual, of both.
         up: "y" or "z", the axis of the world that points up, if it is known.
+        camera_height: metres of the only camera above the floor, if it is known; needs `up`.
 
     Raises:
-        InputError: values out of range.
+        InputError: values out of range; a height of several cameras, or without `up`.
     """
 
     def __init__(
@@ -110,8 +116,10 @@ class KeypointBodyTracker(nn.Module):
         keypoint_std: float | None = None,
         pixel_std: float | None = None,
         up: str | None = None,
+        camera_height: float | None = None,
     ) -> None:
         super().__init__()
+        _check_camera_height(camera_height, rig, up)
         self._rig, self.fps = (rig,), float(fps)  # a tuple: its tensors are those of who gives it
         alone = len(rig) == 1
         std_of_one = _KEYPOINT_STD_OF_ONE if keypoint_std is None else keypoint_std
@@ -124,13 +132,15 @@ class KeypointBodyTracker(nn.Module):
             motion = with_body(motion, body)
         elif height is not None:
             motion = with_height(motion, check_height(height))
+        size_std = std_of_legs(motion) if alone else 0.0
         if alone:
             motion = of_one_camera(motion)
-        self.sized = body is not None or height is not None
+        self.sized = body is not None or height is not None or camera_height is not None
         lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
         self.tracker = KeypointTracker(
             rig, self.fps, motion, up=up, lasting_std=lasting,
             lone=LoneNoise((std_of_one / self.keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
+            size_std=size_std, camera_height=camera_height,
         )  # fmt: skip
         self.feet = FootFilter(
             motion.articulation, copy.deepcopy(shipped_foot_prior()), self.fps,
@@ -411,9 +421,11 @@ class KeypointBodyTracker(nn.Module):
         begun = 0 if live else int(poses.started[b].int().argmax())
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
         standing: dict[str, Tensor] = {}
+        if self.tracker.only is not None:
+            standing[COVARIANCE_FROM_PELVIS] = self.tracker.only.covariance_from_pelvis(poses)
         if feet is not None:
             own = mapped(lambda value: value[b, begun:], feet)
-            standing = dict(zip(DETAILS_OF_FEET, own, strict=True))
+            standing |= dict(zip(DETAILS_OF_FEET, own, strict=True))
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
@@ -481,6 +493,27 @@ class KeypointBodyTracker(nn.Module):
         return (*notes, *notes_on_cameras(self.rig.names, doubts))
 
 
+def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -> None:
+    """Raise `InputError` unless a height of the camera, if there is one, can tell the size of a person."""
+    if height is None:
+        return
+    if not 0 < number_of(height) <= _HIGHEST_CAMERA:
+        raise InputError(
+            f"camera_height must lie between 0 and {_HIGHEST_CAMERA:g} m, got {height!r}; it is in metres "
+            "above the floor"
+        )
+    if len(rig) > 1:
+        raise InputError(
+            f"camera_height tells the size of a person whom one camera sees, and there are {len(rig)} "
+            "cameras, which tell it themselves; leave it out"
+        )
+    if up is None:
+        raise InputError(
+            "camera_height tells how far below the camera the floor is, and which way is down is not known; "
+            'give up as well, "y" or "z", the axis of the cameras\' world that points up'
+        )
+
+
 def _names_of(keypoints: Tensor, names: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of keypoints [..., J, 2], those of `BODY_15` if none are given."""
     found = BODY_15.names if names is None else tuple(names)
@@ -519,12 +552,12 @@ def _unknown(track: BodyTrack) -> BodyTrack:
     values: dict[str, Any] = {
         name: torch.full_like(getattr(track, name), torch.nan) for name in names
     }
-    feet = {
+    details = {
         name: torch.full_like(value, torch.nan)
         for name, value in track.details.items()
-        if name in SIZES_OF_FEET
+        if name in (*SIZES_OF_FEET, COVARIANCE_FROM_PELVIS)
     }
-    return replace(track, **values, details={**track.details, **feet})
+    return replace(track, **values, details={**track.details, **details})
 
 
 def with_time(poses: T) -> T:

@@ -47,7 +47,8 @@ def notes_of(
         cameras: their names. there: which keypoints there were. inlier: probability that each was a joint's.
         exchanged: probability that sides were exchanged. coasting: frames without a measurement.
         alone: which of several cameras alone decided, -1 if all did.
-        sized: whether the person's size was given. first_frame: number of the first of the frames.
+        sized: whether the person's size, or the camera's height, was given.
+        first_frame: number of the first of the frames.
     """
     notes = []
     for c, name in enumerate(cameras):
@@ -71,7 +72,7 @@ def notes_of(
     if len(cameras) == 1 and not sized:
         notes.append(
             "one camera does not tell how large a person is: size and distance are those of the persons "
-            "of the prior; give height or body if they are known"
+            "of the prior; give height, body, or camera_height with up, if they are known"
         )
     guessed = int((alone >= 0).sum())
     if guessed and not sized:

@@ -1,7 +1,7 @@
 """Track bodies through keypoints: begin, filter, begin anew where a person was lost, smooth."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +9,6 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
-from torchpose.body._articulation import BodyPoint
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
@@ -17,6 +16,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     BodyKalmanFilter,
     CorrectedBody,
 )
+from torchpose.whole_body._keypoints.body_size import BodySize
 from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
@@ -29,6 +29,11 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
 )
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, Weighed
+from torchpose.whole_body._keypoints.keypoint_poses import (
+    KeypointPoses,
+    KeypointStep,
+    KeypointStream,
+)
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
 from torchpose.whole_body._keypoints.known_person import of_one_camera, std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, contradicts, corrected_by
@@ -43,66 +48,13 @@ from torchpose.whole_body._keypoints.lone_camera import (
     state_of,
 )
 from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.only_camera import OnlyCamera
 
 LEAST_JOINTS = 6  # that are measured where tracking begins
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 _AWAY = 0.5  # of a lost frame counts one in which several cameras see nobody: a second until a new start
-
-
-class KeypointStream(NamedTuple):
-    """Holds the state of tracking B persons between two frames.
-
-    Attributes:
-        state: Gaussians of [B]. begun: [B], whether the person was found.
-        lost: [B], for how many frames in a row most keypoints have been of something else, or there were
-            none, which counts half, or the person has waited for a start.
-        alone: [B], which of several cameras alone the person is followed by, -1 if by all.
-        memory: [B, L, W], of the network that lifts keypoints of one camera.
-        faults: of the cameras, as each person tells them.
-    """
-
-    state: BodyGaussian
-    begun: Tensor
-    lost: Tensor
-    alone: Tensor
-    memory: Tensor
-    faults: CameraFaults
-
-
-class KeypointPoses(NamedTuple):
-    """Holds the poses of B persons; of T frames [B, T, ...], or of one [B, ...].
-
-    Attributes:
-        joints: [..., J, 3], metres, world axes. covariance: [..., J, 3, 3], metres squared.
-        point: the states, on the manifold. state_cov: [..., N, N], in their tangent spaces.
-        inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of
-            arms, of legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...],
-            where tracking began. alone: [...], which of several cameras alone decided, -1 if all did.
-        turn: [..., C, 3, 3], rotation in world axes by which keypoints of a camera were turned back.
-        off: [..., C], which cameras counted not.
-        scale: [..., C], factors of the cameras' noise. joint_cov: [..., J, 3, 3], without what frames do not
-            average out, which `covariance` has on top.
-    """
-
-    joints: Tensor
-    covariance: Tensor
-    point: BodyPoint
-    state_cov: Tensor
-    inlier: Tensor
-    exchanged: Tensor
-    log_evidence: Tensor
-    coasting: Tensor
-    started: Tensor
-    alone: Tensor
-    turn: Tensor
-    off: Tensor
-    scale: Tensor
-    joint_cov: Tensor
-
-
-KeypointStep = tuple[KeypointStream, KeypointPoses, CorrectedBody]
 
 
 class KeypointTracker(nn.Module):
@@ -114,6 +66,9 @@ class KeypointTracker(nn.Module):
         lasting_std: metres, of what is wrong with joints for so long that frames do not average it out, along
             each axis; covariances of joints have it on top.
         lone: noise where one of several cameras alone sees a person.
+        size_std: of the log of a person's size, in the covariances of poses of one camera; 0 leaves out what
+            it does not tell.
+        camera_height: metres of the only camera above the floor, which tells the size; needs `up`.
     """
 
     def __init__(
@@ -125,12 +80,16 @@ class KeypointTracker(nn.Module):
         up: str | None = None,
         lasting_std: float = 0.0,
         lone: LoneNoise = SAME_NOISE,
+        size_std: float = 0.0,
+        camera_height: float | None = None,
     ) -> None:
         super().__init__()
         self.lasting_std, self.lone = lasting_std, lone
+        self.size_std = size_std
         self._rig = (rig,)  # a tuple, so that its tensors are held once
         self.lifter = PoseLifter(rig, fps, motion, up) if len(rig) == 1 else None
         self.filter = BodyKalmanFilter(motion, rig, fps, n_iterations, up)
+        self.only = OnlyCamera(self.filter, camera_height, lasting_std) if size_std > 0 else None
 
     def forward(
         self,
@@ -177,9 +136,12 @@ class KeypointTracker(nn.Module):
         Returns:
             The next stream, the poses of the frame [B, ...], and what the correction gave.
         """
-        if self.lifter is not None or not watch:
+        if self.lifter is not None:
             step = self._advanced(stream, frame, predicted, waited)
-            return step if self.lifter is not None else self._with_lone_cameras(stream, frame, step)
+            return step if self.only is None else self.only.at_size(step)
+        if not watch:
+            step = self._advanced(stream, frame, predicted, waited)
+            return self._with_lone_cameras(stream, frame, step)
         faults = CameraFaults.none(frame) if stream is None else stream.faults
         given = without_still(frame, faults)
         right = corrected(given, faults, self.filter.maps)
@@ -202,7 +164,8 @@ class KeypointTracker(nn.Module):
             due, nobody = enough, torch.full_like(enough, NOBODY, dtype=torch.long)
             found = self._started(frame, lifted)
             lost, faults = torch.zeros_like(count), CameraFaults.none(frame)
-            stream = KeypointStream(found.state, enough, lost, nobody, memory, faults)
+            size, spread = BodySize.usual(self.size_std, count), torch.zeros_like(found.state.doubt)
+            stream = KeypointStream(found.state, enough, lost, nobody, memory, faults, size, spread)
         else:
             predicted = self.filter.predict(stream.state) if predicted is None else predicted
             found = self._followed(frame, lifted, predicted)
@@ -213,9 +176,12 @@ class KeypointTracker(nn.Module):
             if bool(due.any()):
                 found = self._begun_anew(found, frame, lifted, due)
             lost, alone = torch.where(due, 0.0, stream.lost), torch.where(due, NOBODY, stream.alone)
-            stream = KeypointStream(
-                found.state, stream.begun | due, lost, alone, memory, stream.faults
+            stream = stream._replace(
+                state=found.state, begun=stream.begun | due, lost=lost, alone=alone, memory=memory
             )
+        if lifted is not None:
+            spread = torch.where(lifted.std.isfinite(), lifted.std, stream.spread)
+            stream = stream._replace(spread=spread)
         stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
         return stream, self._posed(stream, found, due), found
 
@@ -229,6 +195,7 @@ class KeypointTracker(nn.Module):
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
             stream.faults.turn, stream.faults.off, found.state.scale, found.joint_cov,
+            stream.size, stream.spread,
         )  # fmt: skip
 
     def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:
@@ -335,7 +302,9 @@ class KeypointTracker(nn.Module):
             there = _sees_enough(frame.inlier > 0)
             gone = ~(seen.inlier > 0).flatten(1).any(-1) & there.any(-1)
             lost = torch.where(gone, before.lost + 1, lost)
-        stream = KeypointStream(state, after.begun, lost, alone, after.memory, stream.faults)
+        stream = stream._replace(
+            state=state, begun=after.begun, lost=lost, alone=alone, memory=after.memory
+        )
         pose = one._replace(
             covariance=self._unsure(by_one.joint_cov, by_one.joints, alone),
             inlier=into_all(torch.zeros_like(pose.inlier), one.inlier, camera),
@@ -468,13 +437,14 @@ class KeypointTracker(nn.Module):
         cov = result.cov.transpose(0, 1)
         joints, jacobian = self.filter.articulation.linearise(point)
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
-        return filtered._replace(
+        poses = filtered._replace(
             joints=joints,
             covariance=self._unsure(joint_cov, joints, filtered.alone),
             point=point,
             state_cov=cov,
             joint_cov=joint_cov,
         )
+        return poses if self.only is None else self.only.at_last_size(poses)
 
 
 def _sees_enough(there: Bool[Tensor, "B C J"]) -> Bool[Tensor, "B C"]:

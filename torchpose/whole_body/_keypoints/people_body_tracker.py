@@ -22,10 +22,8 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     with_time,
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_tracker import (
-    KeypointPoses,
-    stacked,
-)
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
+from torchpose.whole_body._keypoints.keypoint_tracker import stacked
 from torchpose.whole_body._keypoints.nested import taken
 from torchpose.whole_body._keypoints.people_association import (
     pairs_of_detections,

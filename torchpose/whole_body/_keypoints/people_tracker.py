@@ -9,11 +9,8 @@ from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_tracker import (
-    KeypointPoses,
-    KeypointStream,
-    KeypointTracker,
-)
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.people_association import (
     assign,
