@@ -29,7 +29,10 @@ _NOTE = (
 _SEVERAL = (
     "Errors are in the axes of the room. 'seldom seen': joints that fewer than two cameras see. "
 )
-_ONE = "Errors are relative to the pelvis. 'seldom seen': joints that the camera does not see. "
+_ONE = (
+    "Errors are relative to the pelvis, and so are ellipsoids. 'seldom seen': joints that the camera "
+    "does not see. "
+)
 
 
 def score_clips(method: Method, clips: Sequence[Clip], cameras: int) -> list[Score]:

@@ -62,7 +62,8 @@ class BodyTrack:
         joints3d: [T, J, 3], the joints of the estimates, metres, world axes. Those of "kalman" may be
             centimetres from where `state` has them, since its shoulders and hips shift and bones adapt.
         covariance3d: [T, J, 3, 3], the second moment of the particles' joints about them, metres squared;
-            filters with Gaussians include these.
+            filters with Gaussians include these. Of "kalman" in one camera they hold that a person may be
+            larger and farther away.
         log_evidence: [T], the increments log p(z_t | z_1:t-1).
         effective_sample_size: [T], 1 / sum_j w_j^2 of the particles; NaN where there are none.
         coasting: [T], True where no camera saw the person.
@@ -72,8 +73,9 @@ class BodyTrack:
         details: what only some filters report, by name, [T, ...] each (`BodyFilterOutput.details`), such
             as "acceptance", "clamped" and "actions" of `ConstrainedParticleFilter`; of "kalman" "inlier"
             [T, C, J] (probability that a camera's keypoint was the joint's), "exchanged" [T, C, 2] (that
-            left and right were exchanged, of arms and of legs), "bone_lengths" [T, J], metres, and where
-            keypoints have some of feet what `feet` is made of.
+            left and right were exchanged, of arms and of legs), "bone_lengths" [T, J], metres, of one camera
+            "covariance_from_pelvis" [T, J, 3, 3] (of joints relative to the pelvis, metres squared), and
+            where keypoints have some of feet what `feet` is made of.
         action_names: the names of the columns of ``details["actions"]``.
         method: the name of the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files
             of older releases.

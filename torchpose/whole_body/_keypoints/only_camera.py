@@ -2,10 +2,10 @@
 
 That are the size, since who is larger and farther looks the same (`body_size`), and depths of which the
 network that lifts is unsure. It errs in the same way for long, so frames do not average that out, and each
-joint keeps the network's standard deviation s_j along its ray. With p_j from the place of the camera, the
-ray r_j, and covariances P_j of the filter,
+joint keeps 1.25 times the network's standard deviation s_j along its ray. With p_j from the place of the
+camera, the ray r_j, and covariances P_j of the filter,
 
-    P_j + var(l) p_j p_j^T + s_j^2 r_j r_j^T.
+    P_j + var(l) p_j p_j^T + (1.25 s_j)^2 r_j r_j^T.
 """
 
 import torch
@@ -26,6 +26,9 @@ from torchpose.whole_body._keypoints.body_size import (
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStep
 from torchpose.whole_body._keypoints.nested import mapped
 
+# On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
+# strangers to a network that was fitted without them.
+_LASTING = 1.25
 _PELVIS = BODY_15.joint("pelvis")
 
 
@@ -95,4 +98,4 @@ class OnlyCamera:
     def _unsure_depth(self, poses: KeypointPoses) -> Float[Tensor, "*batch J 3 3"]:
         """Return the covariances of what the network does not tell of depths."""
         rays = torch.nn.functional.normalize(poses.joints - self.centre, dim=-1)
-        return poses.spread.square()[..., None, None] * outer(rays)
+        return (_LASTING * poses.spread).square()[..., None, None] * outer(rays)

@@ -1,0 +1,181 @@
+"""One camera does not tell how large and how far a person is, which covariances say, and its height does."""
+
+import math
+
+import pytest
+import torch
+
+import torchpose
+from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, ring, scene
+from torchpose.body import BODY_15
+from torchpose.errors import InputError
+from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
+from torchpose.whole_body._keypoints.body_size import (
+    _ANKLE,
+    _LASTING,
+    BodySize,
+    Floor,
+    resized,
+    tangent_of_size,
+    told_by_floor,
+    units_of_size,
+)
+from torchpose.whole_body._keypoints.keypoint_start import _begun
+
+FLOOR = Floor(torch.tensor([0.0, 1.0, 0.0]).double(), torch.tensor([0.0, 1.5, 0.0]).double(), 1.5)
+STD = 0.07
+ANKLES = [BODY_15.joint("left_ankle"), BODY_15.joint("right_ankle")]
+PELVIS = BODY_15.joint("pelvis")
+
+
+def ankles_at(heights, size=1.0):
+    """Ankles [B, 2, 3] of the filter's size, of larger persons, with ankles at heights above the floor."""
+    real = torch.zeros(*heights.shape, 3, dtype=torch.float64)
+    real[..., 1], real[..., 2] = heights, 4.0
+    return FLOOR.centre + (real - FLOOR.centre) / size
+
+
+def told(heights, size=1.0, frames=300, trust=1.0):
+    found = BodySize.usual(STD, torch.zeros(len(heights), dtype=torch.float64))
+    seen = torch.full(heights.shape, trust, dtype=torch.float64)
+    for _ in range(frames):
+        found = told_by_floor(found, FLOOR, ankles_at(heights, size), seen, 30.0)
+    return found
+
+
+def standing(count=1):
+    return torch.full((count, 2), _ANKLE, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("size", [0.9, 1.1])
+def test_feet_on_the_floor_tell_the_size(size):
+    assert float(told(standing(), size).log) == pytest.approx(math.log(size), abs=0.03)
+
+
+def test_many_frames_do_not_make_the_size_certain():
+    """The height that is given, and that of the ankle, are wrong by the same in all frames."""
+    found = told(standing(), frames=3000)
+    assert float(found.variance.sqrt()) > 0.8 * _LASTING / (1.5 - _ANKLE)
+    assert float(found.variance.sqrt()) < 0.5 * STD
+
+
+def test_lifted_and_hidden_feet_tell_nothing():
+    lifted = told(standing() + 0.4)
+    assert abs(float(lifted.log)) < 0.02
+    hidden = told(standing(), size=1.1, trust=0.0)
+    assert float(hidden.log) == 0 and float(hidden.variance) == pytest.approx(STD**2)
+    one_foot = standing()
+    one_foot[:, 1] += 0.5  # the lower one decides
+    assert float(told(one_foot, 1.1).log) == pytest.approx(math.log(1.1), abs=0.03)
+
+
+def test_a_camera_beside_the_feet_tells_no_size():
+    low = FLOOR._replace(centre=torch.tensor([0.0, _ANKLE, 0.0]).double(), height=_ANKLE)
+    found = BodySize.usual(STD, torch.zeros(1, dtype=torch.float64))
+    for _ in range(100):
+        found = told_by_floor(found, low, ankles_at(standing()), torch.ones(1, 2).double(), 30.0)
+    assert float(found.variance) == pytest.approx(STD**2)
+
+
+def test_a_larger_body_looks_the_same_and_its_tangent_is_that_of_finite_steps():
+    rig, motion = ring(1), load_body_motion("whole-body")
+    body = motion.articulation
+    filter = BodyKalmanFilter(motion, rig, FPS)
+    joints = moving_body(1)
+    point = _begun(filter, joints, torch.ones_like(joints[..., 0], dtype=torch.bool), 1).mean
+    point = point._replace(velocity=torch.randn_like(point.velocity), shifts=point.shifts + 0.01)
+    centre = -(rig.rotation[0].mT @ rig.translation[0])
+    log_size = torch.tensor([0.1], dtype=torch.float64)
+    larger = resized(point, log_size, centre)
+    expected = centre + math.exp(0.1) * (body.joints(point) - centre)
+    torch.testing.assert_close(body.joints(larger), expected)
+    torch.testing.assert_close(rig(body.joints(larger)).pixels, rig(body.joints(point)).pixels)
+    step = 1e-6
+    found = body.difference(resized(point, torch.full_like(log_size, step), centre), point) / step
+    torch.testing.assert_close(tangent_of_size(body, point, centre), found, atol=1e-4, rtol=1e-4)
+    small = 1e-6 * torch.randn(1, body.dim, dtype=torch.float64)
+    moved = body.difference(resized(body.moved(point, small), log_size, centre), larger)
+    torch.testing.assert_close(units_of_size(body, log_size) * small, moved, atol=1e-9, rtol=1e-4)
+
+
+def track(given, smoothing="none", **options):
+    tracker = torchpose.BodyTracker(given.rig, "kalman", fps=FPS, **options)
+    return tracker(
+        keypoints=given.keypoints, confidence=given.confidence, names=NAMES, smoothing=smoothing
+    )
+
+
+def ray_of(given, track):
+    centre = -(given.rig.rotation[0].mT @ given.rig.translation[0])
+    return track.joints3d[-1, PELVIS] - centre
+
+
+@pytest.mark.parametrize("smoothing", ["none", "full"])
+def test_covariances_of_one_camera_do_not_know_the_distance(smoothing):
+    given = scene(1, 25)
+    found, sized = track(given, smoothing), track(given, smoothing, height=1.7)
+
+    def along(poses):
+        away = ray_of(given, poses)
+        ray = away / away.norm()
+        return float((ray @ poses.covariance3d[-1, PELVIS] @ ray).sqrt() / away.norm())
+
+    assert 0.073 < along(found) < 0.08
+    assert 0.028 < along(sized) < 0.04
+    relative = found.details["covariance_from_pelvis"]
+    assert relative.shape == (25, 15, 3, 3) and not relative[:, PELVIS].any()
+    others = [j for j in range(15) if j != PELVIS]
+    assert bool((torch.linalg.eigvalsh(relative[:, others]) > 0).all())
+    leg = found.joints3d[-1, ANKLES[0]] - found.joints3d[-1, PELVIS]
+    unit = leg / leg.norm()
+    assert float((unit @ relative[-1, ANKLES[0]] @ unit).sqrt()) > 0.073 * float(leg.norm())
+
+
+def test_several_cameras_say_nothing_of_the_pelvis():
+    assert "covariance_from_pelvis" not in track(scene(2, 3)).details
+
+
+@pytest.mark.parametrize("height", [1.5, 1.9])
+def test_a_camera_of_known_height_finds_how_large_a_person_is(height):
+    given = scene(1, 30, height=height)
+    floor = float(given.joints[..., 1].min()) - _ANKLE
+    centre = -(given.rig.rotation[0].mT @ given.rig.translation[0])
+    known = {"up": "y", "camera_height": float(centre[1]) - floor}
+    without, found = track(given, "full", up="y"), track(given, "full", **known)
+
+    def off(poses):
+        return float((poses.joints3d - given.joints)[:, PELVIS].norm(dim=-1).mean())
+
+    assert off(found) < 0.5 * off(without)
+    assert abs(found.body.height / height - 1) < abs(without.body.height / height - 1)
+    assert not any("how large" in note for note in found.notes)
+    away = ray_of(given, found)
+    wide, narrow = (float((away @ t.covariance3d[-1, 0] @ away).sqrt()) for t in (without, found))
+    assert narrow < 0.6 * wide
+
+
+def test_live_steps_find_the_size_of_whole_sequences():
+    given = scene(1, 12)
+    tracker = torchpose.BodyTracker(given.rig, "kalman", fps=FPS, up="y", camera_height=1.9)
+    whole = tracker(keypoints=given.keypoints, names=NAMES)
+    stream = tracker.init()
+    for t in range(12):
+        stream, pose = tracker.step(stream, keypoints=given.keypoints[t], names=NAMES)
+    torch.testing.assert_close(pose.joints3d[0], whole.joints3d[-1])
+    torch.testing.assert_close(pose.covariance3d[0], whole.covariance3d[-1])
+    torch.testing.assert_close(
+        pose.details["covariance_from_pelvis"][0], whole.details["covariance_from_pelvis"][-1]
+    )
+
+
+def test_heights_of_cameras_that_tell_nothing_are_refused():
+    with pytest.raises(InputError, match="2 cameras, which tell it themselves"):
+        torchpose.BodyTracker(ring(2), "kalman", up="y", camera_height=1.5)
+    with pytest.raises(InputError, match="which way is down is not known; give up"):
+        torchpose.BodyTracker(ring(1), "kalman", camera_height=1.5)
+    for height in (0.0, -1.0, 110.0, math.nan, "high"):
+        with pytest.raises(InputError, match="between 0 and 30 m"):
+            torchpose.BodyTracker(ring(1), "kalman", up="y", camera_height=height)
+    with pytest.raises(InputError, match="camera_height does nothing"):
+        torchpose.BodyTracker(ring(1), "apf", camera_height=1.5)
