@@ -63,8 +63,10 @@ def add_table(report: Report, clips: Mapping[str, Sequence[ToedClip]], cameras: 
         for name, estimate in found.items():
             scores[name][folder].append(_score(estimate, clip))
     several = "'seldom seen': toes that fewer than two cameras see."
-    one = "Errors are relative to the pelvis, ellipsoids in the axes of the room. 'seldom seen': toes that the "
-    one += "camera does not see."
+    one = (
+        "Errors are relative to the pelvis, ellipsoids in the axes of the room. 'seldom seen': toes that "
+        "the camera does not see."
+    )
     table = report.table(
         title, title, [*(_SETS[name] for name in clips), *_MEASURES],
         note=_NOTE + (several if cameras > 1 else one),

@@ -198,6 +198,18 @@ def test_one_camera_is_enough(track, scene, tmp_path):
     assert "m by its bones, 1.75 m given" in done.out
 
 
+def test_the_height_of_one_camera_is_an_option(track, scene, tmp_path):
+    given = ("front.npz", "--camera-names", "front", *PLAIN)
+    without = track(tmp_path / "without", *given, "--up", "y")
+    done = track(tmp_path / "with", *given, "--up", "y", "--camera-height", 1.2)
+    assert (without.code, done.code) == (0, 0), done.err
+    assert "how large" in without.out and "how large" not in done.out
+    refused = track(tmp_path, *given, "--camera-height", 1.2)
+    assert refused.code == 2 and "give up as well" in refused.err
+    refused = track(tmp_path, *MIXED, "--up", "y", "--camera-height", 1.2)
+    assert refused.code == 2 and "there are 3 cameras" in refused.err
+
+
 @pytest.mark.parametrize("without", [3, 2])
 def test_cameras_without_poses_are_refused(torchpose, scene, tmp_path, without):
     cameras = list(load_cameras(scene[0] / "cameras.toml").values())

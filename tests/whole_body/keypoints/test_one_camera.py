@@ -14,8 +14,8 @@ from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_size import (
     _ANKLE,
     _LASTING,
-    BodySize,
     Floor,
+    SizeBelief,
     resized,
     tangent_of_size,
     told_by_floor,
@@ -37,7 +37,7 @@ def ankles_at(heights, size=1.0):
 
 
 def told(heights, size=1.0, frames=300, trust=1.0):
-    found = BodySize.usual(STD, torch.zeros(len(heights), dtype=torch.float64))
+    found = SizeBelief.usual(STD, torch.zeros(len(heights), dtype=torch.float64))
     seen = torch.full(heights.shape, trust, dtype=torch.float64)
     for _ in range(frames):
         found = told_by_floor(found, FLOOR, ankles_at(heights, size), seen, 30.0)
@@ -72,7 +72,7 @@ def test_lifted_and_hidden_feet_tell_nothing():
 
 def test_a_camera_beside_the_feet_tells_no_size():
     low = FLOOR._replace(centre=torch.tensor([0.0, _ANKLE, 0.0]).double(), height=_ANKLE)
-    found = BodySize.usual(STD, torch.zeros(1, dtype=torch.float64))
+    found = SizeBelief.usual(STD, torch.zeros(1, dtype=torch.float64))
     for _ in range(100):
         found = told_by_floor(found, low, ankles_at(standing()), torch.ones(1, 2).double(), 30.0)
     assert float(found.variance) == pytest.approx(STD**2)

@@ -30,7 +30,7 @@ _LIFTED, _HIGHEST = 0.1, 0.6  # share of frames in which both feet are lifted; m
 _NEVER = 1e-3  # per metre, density of a foot anywhere else, below the floor too
 
 
-class BodySize(NamedTuple):
+class SizeBelief(NamedTuple):
     """Holds Gaussians over the log of a person's size against that of the filter, and of b.
 
     Attributes:
@@ -66,12 +66,12 @@ class Floor(NamedTuple):
 
 
 def told_by_floor(
-    size: BodySize,
+    size: SizeBelief,
     floor: Floor,
     ankles: Float[Tensor, "B 2 3"],
     trust: Float[Tensor, "B 2"],
     fps: float,
-) -> BodySize:
+) -> SizeBelief:
     """Return what is believed of sizes after a frame.
 
     Args:
@@ -89,7 +89,7 @@ def told_by_floor(
     weight = seen * _on_the_floor(off, told + noise) / max(1.0, _TIME * fps)
     gain = HP * (weight / (noise + weight * told))[..., None]
     cov = size.cov - gain[..., None] * HP[..., None, :]
-    return BodySize(size.mean + gain * off[..., None], (cov + cov.mT) / 2)
+    return SizeBelief(size.mean + gain * off[..., None], (cov + cov.mT) / 2)
 
 
 def _on_the_floor(off: Float[Tensor, " B"], variance: Float[Tensor, " B"]) -> Float[Tensor, " B"]:

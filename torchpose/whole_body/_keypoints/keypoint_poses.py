@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchpose.body._articulation import BodyPoint
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
-from torchpose.whole_body._keypoints.body_size import BodySize
+from torchpose.whole_body._keypoints.body_size import SizeBelief
 from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults
 
 
@@ -30,7 +30,7 @@ class KeypointStream(NamedTuple):
     alone: Tensor
     memory: Tensor
     faults: CameraFaults
-    size: BodySize
+    size: SizeBelief
     spread: Tensor
 
 
@@ -64,7 +64,7 @@ class KeypointPoses(NamedTuple):
     off: Tensor
     scale: Tensor
     joint_cov: Tensor
-    size: BodySize
+    size: SizeBelief
     spread: Tensor
 
 

@@ -16,7 +16,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     BodyKalmanFilter,
     CorrectedBody,
 )
-from torchpose.whole_body._keypoints.body_size import BodySize
+from torchpose.whole_body._keypoints.body_size import SizeBelief
 from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
@@ -164,7 +164,10 @@ class KeypointTracker(nn.Module):
             due, nobody = enough, torch.full_like(enough, NOBODY, dtype=torch.long)
             found = self._started(frame, lifted)
             lost, faults = torch.zeros_like(count), CameraFaults.none(frame)
-            size, spread = BodySize.usual(self.size_std, count), torch.zeros_like(found.state.doubt)
+            size, spread = (
+                SizeBelief.usual(self.size_std, count),
+                torch.zeros_like(found.state.doubt),
+            )
             stream = KeypointStream(found.state, enough, lost, nobody, memory, faults, size, spread)
         else:
             predicted = self.filter.predict(stream.state) if predicted is None else predicted
