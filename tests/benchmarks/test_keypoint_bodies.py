@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from benchmarks.keypoint_bodies.camera_heights import add_height_table
 from benchmarks.keypoint_bodies.clips import (
     ACTIONS,
     CHOOSING,
@@ -18,6 +19,7 @@ from benchmarks.keypoint_bodies.clips import (
     SCORED,
     WALKS,
     WIDTH,
+    begun,
     bursts,
     draw_ring,
     read_kinect,
@@ -38,6 +40,7 @@ from benchmarks.keypoint_bodies.triangulation import (
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.demo._rendering.walk import walk, walk_clip
+from torchpose.evaluation import Report
 from torchpose.whole_body._keypoints.lifting_network import LiftingNetwork
 
 PEERS = [name for name in METHODS if name not in OURS]
@@ -218,3 +221,24 @@ def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_siz
     network = LiftingNetwork.load(tmp_path / "lifting.safetensors")
     assert network.info.recordings == ("mocap_cmu_walk/s02_*", "kinect_utd_mhad/s01_*")
     assert 0.6 < network.info.legs < 1.0
+
+
+def test_heights_of_cameras_are_told_rightly_and_wrongly(walker):
+    """The room is that of the recording, in which up is any axis that the tracker takes."""
+    clip, told = begun(see(walker, faults=CLEAN), 5).of_cameras(1), []
+
+    def method(rig, keypoints, confidence, fps, **options):
+        told.append(options)
+        return Estimate(clip.joints)
+
+    report = Report("heights")
+    add_height_table(report, {"kalman": method}, [clip], "rings")
+    add_height_table(report, {"mlp": method}, [clip], "known", height=2.0)
+    add_height_table(report, {"kalman": method}, [clip], "known too", height=2.0)
+    centre = -(clip.rig.rotation[0].mT @ clip.rig.translation[0])
+    up = "xyz"[int(clip.up.argmax())]
+    known = [pytest.approx(float(centre @ clip.up) + off) for off in (0, 0.05, -0.05, 0.1, -0.1)]
+    expected = [{}, *({"up": up, "camera_height": height} for height in known)]
+    assert told[:7] == [*expected, {}]
+    assert [one.get("camera_height") for one in told[7:9]] == [None, 2.0]
+    assert len(report.tables["rings"].rows) == 6 and len(report.tables["known"].rows) == 1
