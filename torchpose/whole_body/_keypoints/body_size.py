@@ -53,7 +53,7 @@ class SizeBelief(NamedTuple):
     @classmethod
     def usual(cls, std: float, like: Float[Tensor, " B"]) -> Self:
         """Return what is expected of B persons."""
-        cov = torch.tensor([std**2, _LASTING**2]).to(like).diag()
+        cov = like.new_tensor([std**2, _LASTING**2]).diag()
         return cls(like.new_zeros(len(like), 2), cov.expand(len(like), 2, 2))
 
 
@@ -96,8 +96,8 @@ def _on_the_floor(off: Float[Tensor, " B"], variance: Float[Tensor, " B"]) -> Fl
     """Return the probability that the lower foot stands, by how far its ankle is above one that does."""
     standing = (1 - _LIFTED) * torch.exp(-0.5 * off.square() / variance)
     standing = standing / (2 * math.pi * variance).sqrt()
-    lifted = (off > 0) & (off < _HIGHEST)
-    return standing / (standing + _LIFTED * torch.where(lifted, 1 / _HIGHEST, _NEVER))
+    lifted = torch.full_like(off, _NEVER).masked_fill((off > 0) & (off < _HIGHEST), 1 / _HIGHEST)
+    return standing / (standing + _LIFTED * lifted)
 
 
 def resized(
