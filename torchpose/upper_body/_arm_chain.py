@@ -33,7 +33,7 @@ _LEAST = 1e-30  # density
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 # Directions, and arms of which all pairs of directions are compared, at a time: so that intermediate
 # results stay in the cache.
-_ROWS, _ARMS = 5120, 2
+_ROWS, _ARMS = 1280, 2
 
 
 class ArmInput(NamedTuple):
