@@ -6,9 +6,12 @@ import torch
 from scipy.stats import multivariate_normal
 
 from tests.filters.oracles import random_covariance, random_mixture, tensor
-from torchpose.errors import InputError
+from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.filters import MixtureKalmanFilter, _memoryless
+from torchpose.filters._frame_noise import point_blocks
+from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import Wanted, run_with_context
+from torchpose.filters._side_by_side import SideBySide
 from torchpose.math._gaussian import kalman_gain
 from torchpose.math._geometric_median import median_columns
 from torchpose.priors import GaussianMixture
@@ -203,6 +206,49 @@ def test_wanted_dimensions_and_the_context_are_those_of_whole_filters(own_noise)
     first = mask & torch.tensor([True, True, False])
     expected = filter_(z, first, noise).log_evidence
     torch.testing.assert_close(context, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("own_noise", [False, True])
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+@pytest.mark.parametrize("medians", [(), (1,)])
+def test_filters_side_by_side_give_the_numbers_of_each_by_itself(own_noise, missing, medians):
+    columns, parts = (2, 0, 1, 3, 1, 2), []
+    wanted = Wanted(columns, 2, of_points=True)
+    points = torch.tensor([[3, 4, 5]])[: len(medians)]
+    for seed in (0, 1):
+        model, z, mask = problem(missing=missing, seed=seed)
+        noise = torch.eye(3, dtype=torch.float64) * (0.5 + torch.rand(3, 7, 1, 1) * own_noise)
+        filter_ = make_filter(model, gamma=0.0, medians=medians)
+        frames = filter_.check(tensor(z), torch.as_tensor(mask), noise, None, None)
+        if not own_noise:
+            frames = frames._replace(cov=filter_.own_noise())
+        parts.append((filter_, frames))
+    filters = [filter_ for filter_, _ in parts]
+    both = SideBySide(filters, [filter_.weight_rule for filter_ in filters])
+    frames = Measurements(*map(torch.stack, zip(*(own for _, own in parts), strict=True)))
+    out, context = run_with_context(both, both.weight_rule, points, frames, True, wanted)
+    whole = wanted._replace(of_points=False)
+    for i, (filter_, own) in enumerate(parts):
+        rows = slice(3 * i, 3 * i + 3)
+        alone, told = run_with_context(filter_, filter_.weight_rule, points, own, True, whole)
+        for name in ("mean", "log_weights", "log_evidence"):
+            found = getattr(out, name)[rows]
+            torch.testing.assert_close(found, getattr(alone, name), rtol=1e-11, atol=1e-12)
+        torch.testing.assert_close(out.cov[rows], point_blocks(alone.cov), rtol=1e-11, atol=1e-12)
+        torch.testing.assert_close(context[rows], told, rtol=1e-11, atol=1e-12)
+
+
+def test_what_fails_beside_another_filter_is_named_by_its_sequence():
+    model, z, mask = problem(missing=0.0)
+    filter_ = make_filter(model, gamma=0.0)
+    frames = filter_.check(tensor(z), torch.as_tensor(mask), None, None, None)
+    both = SideBySide([filter_] * 2, [filter_.weight_rule] * 2)
+    pair = Measurements(*(torch.stack([part, part]) for part in frames))
+    pair.z[1, 2, 4] = torch.nan
+    given = both.weight_rule, torch.empty(0, 3, dtype=torch.long), pair, False, Wanted()
+    with pytest.warns(DegenerateFilterWarning, match=r"1 of 3 .*element 2 at frame 4"):
+        out, _ = run_with_context(both, *given)
+    assert out.failed_at.tolist() == [-1, -1, -1, -1, -1, 4]
 
 
 def test_gains_are_made_for_a_noise_that_comes_again(monkeypatch):

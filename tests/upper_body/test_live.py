@@ -258,7 +258,7 @@ def test_a_step_is_a_bounded_number_of_operations(few):
     tracker = UpperBodyTracker(prior, prior.camera, fps=30.0)
     keypoints, generator = few[:1], torch.Generator().manual_seed(0)
     drawn = 0.5 + 0.5 * torch.rand(keypoints.shape[:-1], generator=generator)
-    for confidence, most in ((torch.ones_like(drawn), 2150), (drawn, 2350)):
+    for confidence, most in ((torch.ones_like(drawn), 2030), (drawn, 2150)):
         with torch.inference_mode():
             state, _ = stream(tracker, keypoints[:, :12], confidence=confidence[:, :12])
             with Counter() as counter:

@@ -21,8 +21,13 @@ from torchpose._core.module_state import derived
 from torchpose._core.value_checks import values_visible
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._recompute import wants_gradient
+from torchpose.filters._side_by_side import SideBySide
+from torchpose.filters._weights import between
 from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
 from torchpose.math._geometric_median import with_medians
+
+Tracks = MixtureKalmanFilter | SideBySide
+"""Mixtures of one filter, or of A filters side by side, of which tensors have a leading axis more."""
 
 
 class FrameNoise(NamedTuple):
@@ -56,25 +61,31 @@ class MeasuredParts(NamedTuple):
     """Holds what no R changes, with means, covariances and A of the dimensions that are wanted.
 
     Attributes:
-        centre: H mu [K, Z]. rows: A = H Sigma [K, Z, D]. block: C = H Sigma H^T [K, Z, Z].
-        means, covs: mu [K, D] and Sigma [K, D, D].
+        centre: H mu [*A, K, Z]. block: C = H Sigma H^T [*A, K, Z, Z].
+        padded: A with columns of zeros behind it, which makes products faster.
+        means, covs: mu [*A, K, D] and Sigma [*A, K, D, D], or [*A, K, P, 3, 3] of points.
     """
 
     centre: Tensor
-    rows: Tensor
+    padded: Tensor
     block: Tensor
     means: Tensor
     covs: Tensor
+
+    @property
+    def rows(self) -> Tensor:
+        """Return A = H Sigma, [*A, K, Z, D]."""
+        return self.padded[..., : self.means.shape[-1]]
 
 
 class OwnFrames(NamedTuple):
     """Holds the components given N frames each.
 
     Attributes:
-        factor: L [N, K, Z, Z]; a missing measurement has the row and column of the identity.
-        white: v [N, K, Z], 0 where missing. log_likelihood: [N, K]. log_context: that of the first
-            measurements alone [N, K], or None.
-        jitter: of the S [N, K], or None; see `mended_cholesky`. mask: [N, Z], True where measured.
+        factor: L [*A, N, K, Z, Z]; a missing measurement has the row and column of the identity.
+        white: v [*A, N, K, Z], 0 where missing. log_likelihood: [*A, N, K]. log_context: that of the first
+            measurements alone [*A, N, K], or None.
+        jitter: of the S [*A, N, K], or None; see `mended_cholesky`. mask: [*A, N, Z], True where measured.
     """
 
     factor: Tensor
@@ -86,11 +97,11 @@ class OwnFrames(NamedTuple):
 
 
 def condition_own(
-    model: MixtureKalmanFilter,
+    model: Tracks,
     parts: MeasuredParts,
-    z: Float[Tensor, "N Z"],
-    mask: Bool[Tensor, "N Z"],
-    noise: Float[Tensor, "N Z Z"],
+    z: Float[Tensor, "*A N Z"],
+    mask: Bool[Tensor, "*A N Z"],
+    noise: Float[Tensor, "*A N Z Z"],
     n_context: int = 0,
 ) -> OwnFrames:
     """Return the innovations and likelihoods of all components for frames with an R of their own.
@@ -100,11 +111,13 @@ def condition_own(
         n_context: the number of the first measurements whose likelihood is wanted too; 0 is none.
     """
     noise, both = _own_noise(noise, mask)
-    factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
+    noise, both, block = noise[..., None, :, :], both[..., None, :, :], parts.block
+    factor, jitter = mended_cholesky(torch.addcmul(noise, block[..., None, :, :, :], both))
     scale = factor.diagonal(dim1=-2, dim2=-1)
-    norms = -0.5 * LOG_2PI * mask[:, None].to(scale) - scale.log()
+    norms = -0.5 * LOG_2PI * mask[..., None, :].to(scale) - scale.log()
     factor = factor.to(model.dtype)
-    residual = (z[:, None] - parts.centre.to(model.dtype)) * mask[:, None]
+    centre = parts.centre.to(model.dtype)[..., None, :, :]
+    residual = (z[..., None, :] - centre) * mask[..., None, :]
     white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
     squares = white.square()
     log_likelihood = _log_density(norms, squares)
@@ -115,8 +128,8 @@ def condition_own(
 
 
 def _log_density(
-    norms: Float[Tensor, "N K Z"], squares: Float[Tensor, "N K Z"]
-) -> Float[Tensor, "N K"]:
+    norms: Float[Tensor, "*batch K Z"], squares: Float[Tensor, "*batch K Z"]
+) -> Float[Tensor, "*batch K"]:
     """Return the log-density of whitened innovations, of which the squares and normalisers are given."""
     return norms.sum(-1).to(squares).sub(squares.sum(-1), alpha=0.5)
 
@@ -144,42 +157,74 @@ def _own_noise(
 
 
 def own_moments(
-    model: MixtureKalmanFilter,
+    model: Tracks,
     parts: MeasuredParts,
     frames: OwnFrames,
-    log_weights: Float[Tensor, "N K"],
+    log_weights: Float[Tensor, "*A N K"],
     medians: Int[Tensor, "P 3"],
     return_cov: bool,
-) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
+    of_points: bool = False,
+) -> tuple[Float[Tensor, "*A N D"], Tensor | None]:
     """Return the estimates of the mixture (BL 48) and, on request, their second moments about these.
 
     Args:
         parts: from `measured_parts`. frames: from `condition_own`. log_weights: normalised.
         medians: the dimensions of points that are estimated by their geometric median.
+        of_points: whether the moments of each three consecutive dimensions are wanted alone.
     """
     weights = log_weights.exp()
     rows, centres = parts.rows.to(model.dtype), parts.means.to(model.dtype)
     solved = torch.linalg.solve_triangular(frames.factor.mT, frames.white[..., None], upper=True)
     solved = solved[..., 0]
-    gained = (weights[..., None] * solved).flatten(1)
-    mean = weights @ centres + gained @ rows.flatten(0, 1)
+    gained = (weights[..., None] * solved).flatten(-2)
+    mean = weights @ centres + gained @ rows.flatten(-3, -2)
     if not (return_cov or len(medians)):
         return mean, None
     # A_j^T S_j^-1 (z - H mu_j) is the move of every mean
-    means = centres + torch.bmm(solved.transpose(0, 1), rows).transpose(0, 1)
+    moves = (solved.transpose(-3, -2) @ rows).transpose(-3, -2)
+    means = centres[..., None, :, :] + moves
+    columns = medians.flatten()
+    padded = parts.padded.to(model.dtype)
+    explained, of_each = _explained(padded, frames.factor, frames.mask, weights, columns)
     if len(medians):
-        variances = _variances(parts, rows, frames, medians)
+        prior = variances_of(parts.covs, of_points)[..., None, :, columns].to(rows)
+        variances = (prior - of_each).unflatten(-1, medians.shape)
         mean = with_medians(mean, weights, means[..., medians], variances, medians)
-    return mean, _covariance(parts, rows, frames, weights, means, mean) if return_cov else None
+    if not return_cov:
+        return mean, None
+    dim = rows.shape[-1]
+    moved = between(weights, means, mean) - explained[..., :dim, :dim]
+    prior = mixed(weights, parts.covs.to(rows), of_points)
+    return mean, prior + (point_blocks(moved) if of_points else moved)
+
+
+def mixed(weights: Float[Tensor, "*A N K"], covs: Tensor, of_points: bool) -> Tensor:
+    """Return sum_j w_j P_j, of whole covariances or of those of points."""
+    n_dims = 3 if of_points else 2
+    flat = covs.flatten(-n_dims).to(weights.dtype)
+    return (weights @ flat).unflatten(-1, covs.shape[-n_dims:])
+
+
+def point_blocks(covs: Float[Tensor, "*batch D D"]) -> Float[Tensor, "*batch P 3 3"]:
+    """Return the covariances of each three consecutive dimensions, P = D / 3."""
+    blocks = covs.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
+    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+
+
+def variances_of(covs: Tensor, of_points: bool) -> Tensor:
+    """Return the variances [..., D] of covariances, or of those of points."""
+    variances = covs.diagonal(dim1=-2, dim2=-1)
+    return variances.flatten(-2) if of_points else variances
 
 
 def measured_parts(
-    model: MixtureKalmanFilter, wanted: tuple[int, ...] | None = None
+    model: Tracks, wanted: tuple[int, ...] | None = None, of_points: bool = False
 ) -> MeasuredParts:
     """Return what no R changes, kept while the mixture stays as it is.
 
     Args:
         wanted: the state dimensions that are estimated; None is all.
+        of_points: whether the covariances of each three of them are wanted alone.
     """
 
     def make() -> MeasuredParts:
@@ -188,55 +233,48 @@ def measured_parts(
         block = rows.index_select(-1, model.observed)
         if wanted is not None:
             columns = torch.tensor(wanted, device=means.device)
-            rows, means = rows.index_select(-1, columns), means[:, columns]
-            covs = covs[:, columns[:, None], columns]
-        return MeasuredParts(model.means[:, model.observed], rows, block, means, covs)
+            rows, means = rows.index_select(-1, columns), means[..., columns]
+            covs = covs[..., columns[:, None], columns]
+        covs = point_blocks(covs).contiguous() if of_points else covs
+        padded = pad(rows, (0, spare_columns(rows.shape[-1])))
+        return MeasuredParts(model.means[..., model.observed], padded, block, means, covs)
 
-    return derived(model, ("measured parts", wanted), (model.means, model.covariances), make)
-
-
-def _covariance(
-    parts: MeasuredParts,
-    rows: Tensor,
-    frames: OwnFrames,
-    weights: Tensor,
-    means: Float[Tensor, "N K D"],
-    mean: Tensor,
-) -> Float[Tensor, "N D D"]:
-    """Return sum_j w_j (Sigma_j + (m_j - m)(m_j - m)^T) - sum_j w_j W_j^T W_j."""
-    apart = (means - mean[:, None]) * weights[..., None].sqrt()
-    prior = weights @ parts.covs.to(rows).flatten(1)
-    explained = _explained(frames.factor, rows, weights, frames.mask)
-    return prior.unflatten(-1, rows.shape[-1:] * 2) + apart.mT @ apart - explained
+    sources = (model.means, model.covariances)
+    return derived(model, ("measured parts", wanted, of_points), sources, make)
 
 
 def _explained(
-    factor: Float[Tensor, "N K Z Z"], rows: Float[Tensor, "K Z D"], weights: Tensor, mask: Tensor
-) -> Float[Tensor, "N D D"]:
-    """Return sum_j w_j W_j^T W_j, what the measurements take off the covariances."""
-    shares = weights.sqrt()[..., None, None] * mask[:, None, :, None]
+    rows: Float[Tensor, "*A K Z D"],
+    factor: Float[Tensor, "*A N K Z Z"],
+    mask: Bool[Tensor, "*A N Z"],
+    weights: Float[Tensor, "*A N K"],
+    columns: Int[Tensor, " C"],
+) -> tuple[Float[Tensor, "*A N D D"], Float[Tensor, "*A N K C"]]:
+    """Return sum_j w_j W_j^T W_j, which the measurements take off the covariances, and off variances of each.
+
+    Args:
+        rows: A of `MeasuredParts`. factor: L. mask: True where measured. weights: w.
+        columns: the dimensions whose variances are wanted, the diagonal of W_j^T W_j.
+    """
     if not values_visible() or wants_gradient(factor, rows, weights):
-        white = torch.linalg.solve_triangular(factor, rows * shares, upper=False).flatten(1, 2)
-        return white.mT @ white
+        seen = rows[..., None, :, :, :] * mask[..., None, :, None]
+        white = torch.linalg.solve_triangular(factor, seen, upper=False)
+        of_each = white[..., columns].square().sum(-2)
+        scaled = (white * weights.sqrt()[..., None, None]).flatten(-3, -2)
+        return scaled.mT @ scaled, of_each
+    if rows.ndim > 3:
+        each = zip(rows, factor, mask, weights, strict=True)
+        explained, of_each = zip(*(_explained(*own, columns) for own in each), strict=True)
+        return torch.stack(explained), torch.stack(of_each)
     # One frame at a time stays in the cache, in memory that is used again.
-    dim = rows.shape[-1]
-    rows = pad(rows, (0, spare_columns(dim)))
-    white = torch.empty_like(rows).flatten(0, 1)
-    explained = rows.new_empty(len(factor), *rows.shape[-1:] * 2)
+    white, dim = torch.empty_like(rows), rows.shape[-1]
+    flat, found = white.flatten(0, 1), []
+    total = rows.new_empty(len(factor), dim, dim)
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
-    for own, share, total in zip(factor, shares, explained, strict=True):
-        inverse = torch.linalg.solve_triangular(own, share.mT * eye, upper=False)
-        torch.bmm(inverse, rows, out=white.view_as(rows))
-        torch.mm(white.T, white, out=total)
-    return explained[:, :dim, :dim]
-
-
-def _variances(
-    parts: MeasuredParts, rows: Tensor, frames: OwnFrames, points: Int[Tensor, "P 3"]
-) -> Float[Tensor, "N K P 3"]:
-    """Return the variances of all components in the dimensions of some points."""
-    columns = points.flatten()
-    seen = rows[..., columns] * frames.mask[:, None, :, None]
-    white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)
-    prior = parts.covs.diagonal(dim1=-2, dim2=-1)[:, columns].to(rows)
-    return (prior - white.square().sum(-2)).unflatten(-1, points.shape)
+    for own, seen, share, out in zip(factor, mask, weights.sqrt(), total, strict=True):
+        inverse = torch.linalg.solve_triangular(own, seen * eye, upper=False)
+        torch.bmm(inverse, rows, out=white)
+        found.append(white[..., columns].square().sum(-2))
+        white.mul_(share[:, None, None])
+        torch.mm(flat.T, flat, out=out)
+    return total, torch.stack(found)

@@ -40,6 +40,10 @@ class Measurements(NamedTuple):
         cov = self.cov if self.cov.ndim == 2 else self.cov[chunk]
         return Measurements(self.z[chunk], self.mask[chunk], cov, self.lengths[chunk])
 
+    def of_filter(self, i: int) -> "Measurements":
+        """Return the measurements of one of some filters side by side."""
+        return Measurements(*(values[i] for values in self))
+
     def as_sequences(self) -> "Measurements":
         """Return the measurements of one frame as sequences of a single frame."""
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, None]

@@ -3,7 +3,8 @@
 With weights by frame, the indicator of every frame is drawn from pi independently, as for sampled
 tracks (BL 47); the track of each component still carries its state from frame to frame. Where the
 states carry nothing over either (transition "ou" with gamma = 0), frames are independent, and
-`run_memoryless` conditions the mixture on all of them at once.
+`run_memoryless` conditions the mixture on all of them at once. Several such filters that measure the
+same dimensions run side by side (`SideBySide`), with a leading axis of A filters in all that they hold.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,16 +20,21 @@ from torchpose._core.value_checks import values_visible
 from torchpose.filters._frame_noise import (
     MeasuredParts,
     OwnFrames,
+    Tracks,
     condition_own,
     log_normaliser,
     measured_parts,
+    mixed,
     own_moments,
+    point_blocks,
+    variances_of,
 )
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
 from torchpose.filters._recompute import recomputed, wants_gradient
-from torchpose.filters._weights import WeightRule, frame_weights, normalise, within_and_between
+from torchpose.filters._side_by_side import SideBySide, stacked
+from torchpose.filters._weights import WeightRule, between, frame_weights, normalise
 from torchpose.math._gaussian import Gain, kalman_gain
 from torchpose.math._geometric_median import median_columns, with_medians
 
@@ -59,10 +65,13 @@ class Wanted(NamedTuple):
     Attributes:
         columns: the state dimensions that are estimated, in this order; None is all.
         n_context: the number of the first measurements whose evidence is wanted by itself.
+        of_points: whether of the covariances those of each three consecutive dimensions are wanted alone,
+            [..., D / 3, 3, 3].
     """
 
     columns: tuple[int, ...] | None = None
     n_context: int = 0
+    of_points: bool = False
 
 
 _ALL = Wanted()
@@ -82,7 +91,7 @@ def conditioned_groups(
     for same in _alike(mask, noise):
         own_noise = frames.cov if noise is None else noise[same[0]]
         for rows in same.split(_RECOMPUTED_FRAMES):
-            group = _Group(rows, z[rows], mask[same[0]], own_noise)
+            group = _Group(rows, z[rows], mask[same[:1]], own_noise)
             shared = _gain(model, group, _ALL)
             given = _condition(model, measured_parts(model), group, shared)
             yield group, given.means, shared.covs, _weighed(rule, group, given.log_likelihood)[0]
@@ -108,7 +117,7 @@ def run_memoryless(
 
 
 def run_with_context(
-    model: MixtureKalmanFilter,
+    model: Tracks,
     rule: WeightRule,
     medians: Int[Tensor, "P 3"],
     frames: Measurements,
@@ -122,21 +131,22 @@ def run_with_context(
     over their standard deviations, so that it takes no filter of its own.
 
     Args:
-        model, rule, frames, return_cov, progress: as `run_memoryless`.
+        model, rule, frames, return_cov, progress: as `run_memoryless`. Of filters side by side frames are
+            [A, B, T, Z], R is [A, Z, Z] or [A, B, T, Z, Z], and results are those of A B sequences.
         medians: the three dimensions of each point that is estimated by its median, among the wanted ones.
         wanted: the dimensions and the context.
     """
-    batch, n_frames, _ = frames.z.shape
+    n_frames = frames.z.shape[-2]
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[] for _ in range(7)]
-    shared = measured_parts(model, wanted.columns)
+    shared = measured_parts(model, wanted.columns, wanted.of_points)
     at_a_time = _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES
     # a bar that shows nothing would still keep torch.compile out
-    bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
+    bar = tqdm(total=frames.z.shape[-3] * n_frames, unit="frame") if progress else None
     for group in _groups(model, frames, at_a_time, wanted):
         # Gains and parts that groups share are not among what a gradient computes anew for one of them.
         gain = _gain(model, group, wanted) if group.shares_gain else None
-        arguments = model, rule, medians, group, gain, shared, return_cov, wanted.n_context
+        arguments = model, rule, medians, group, gain, shared, return_cov, wanted
         values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
         for part, value in zip(parts, values, strict=True):
             if value is not None:
@@ -145,67 +155,77 @@ def run_with_context(
             bar.update(len(group.rows))
     if bar is not None:
         bar.close()
-    mean, log_weights, evidence = (
-        _in_order(part).unflatten(0, (batch, n_frames)) for part in parts[:3]
+    mean, log_weights, evidence, mended, jitter = (
+        _in_order(parts[i]).unflatten(0, (-1, n_frames)) for i in (0, 1, 2, 4, 5)
     )
-    covs = _in_order(parts[3]).unflatten(0, (batch, n_frames)) if return_cov else None
-    work = Mending(*(_in_order(part).unflatten(0, (batch, n_frames)) for part in parts[4:6]))
-    context = _in_order(parts[6]).unflatten(0, (batch, n_frames)) if wanted.n_context else None
-    return finish_output(mean, log_weights, evidence, covs, frames.lengths, work), context
+    covs = _in_order(parts[3]).unflatten(0, (-1, n_frames)) if return_cov else None
+    context = _in_order(parts[6]).unflatten(0, (-1, n_frames)) if wanted.n_context else None
+    lengths, n_filters = frames.lengths.flatten(), frames.z.shape[:-3].numel()
+    given = lengths, Mending(mended, jitter), n_filters
+    return finish_output(mean, log_weights, evidence, covs, *given), context
 
 
 def _estimate(
-    model: MixtureKalmanFilter,
+    model: Tracks,
     rule: WeightRule,
     medians: Tensor,
     group: "_Group",
     gain: "_SharedGain | None",
     shared: MeasuredParts,
     return_cov: bool,
-    n_context: int = 0,
+    wanted: Wanted = _ALL,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Tensor | None]:
-    """Return the estimates of a group of frames.
+    """Return the estimates of a group of frames, those of filters side by side one after the other.
 
     They are means, log-weights, log-evidence, covariances, both parts of the mending, and the log-evidence
     of the context.
     """
     given: OwnFrames | _Conditioned
+    n_context, of_points = wanted.n_context, wanted.of_points
     if gain is None:
         given = own = condition_own(model, shared, group.z, group.mask, group.noise, n_context)
     else:
         given = tracks = _condition(model, shared, group, gain, n_context)
     log_weights, evidence = _weighed(rule, group, given.log_likelihood)
     if gain is None:
-        mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
+        mean, total = own_moments(model, shared, own, log_weights, medians, return_cov, of_points)
     else:
-        mean, total = _moments(log_weights, tracks.means, gain.covs, medians, return_cov)
+        each = log_weights, tracks.means, gain.covs
+        mean, total = _moments(*each, medians, return_cov, of_points)
     context = None
     if given.log_context is not None:
         there = group.mask[..., :n_context].any(-1)
         both = torch.logsumexp(normalise(rule.log_prior) + given.log_context, -1)
-        context = torch.where(there, both, 0.0)
-    return mean, log_weights, evidence, total, *mending(mean, given.jitter), context
+        context = torch.where(there, both, 0.0).flatten()
+    mean, log_weights = mean.flatten(0, -2), log_weights.flatten(0, -2)
+    total = None if total is None else total.flatten(0, evidence.ndim - 1)
+    work = mending(mean, given.jitter)
+    return mean, log_weights, evidence.flatten(), total, *work, context
 
 
 def _moments(
-    log_weights: Float[Tensor, "N M"],
-    means: Float[Tensor, "N M D"],
-    covs: Float[Tensor, "M D D"],
+    log_weights: Float[Tensor, "*A N M"],
+    means: Float[Tensor, "*A N M D"],
+    covs: Tensor,
     medians: Int[Tensor, "P 3"],
     return_cov: bool,
-) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
+    of_points: bool,
+) -> tuple[Float[Tensor, "*A N D"], Tensor | None]:
     """Return the estimates of mixtures (BL 48) and, on request, their second moments about these."""
     weights = log_weights.exp()
-    mean = (weights[:, None] @ means)[:, 0]
+    mean = (weights[..., None, :] @ means)[..., 0, :]
     if len(medians):
-        variances = covs.diagonal(dim1=-2, dim2=-1)[..., medians]
+        variances = variances_of(covs, of_points)[..., None, :, medians]
         mean = with_medians(mean, weights, means[..., medians], variances, medians)
-    return mean, within_and_between(weights, means, mean, covs) if return_cov else None
+    if not return_cov:
+        return mean, None
+    apart = between(weights, means, mean)
+    return mean, mixed(weights, covs, of_points) + (point_blocks(apart) if of_points else apart)
 
 
 def _weighed(
-    rule: WeightRule, group: "_Group", log_likelihood: Float[Tensor, "N M"]
-) -> tuple[Float[Tensor, "N M"], Float[Tensor, " N"]]:
+    rule: WeightRule, group: "_Group", log_likelihood: Float[Tensor, "*A N M"]
+) -> tuple[Float[Tensor, "*A N M"], Float[Tensor, "*A N"]]:
     """Return log-weights and log-evidence of a group of frames; 0 where nothing is measured."""
     log_weights, evidence = frame_weights(rule, log_likelihood, log_likelihood)
     return log_weights, torch.where(group.mask.any(-1), evidence, 0.0)
@@ -238,8 +258,8 @@ class _Group(NamedTuple):
     """Holds the frames whose gains are computed together.
 
     Attributes:
-        rows: which of the B T frames [N]. z: [N, Z].
-        mask, noise: [Z] and [Z, Z] for all of them, or [N, Z] and [N, Z, Z].
+        rows: which of the B T frames [N]. z: [*A, N, Z].
+        mask, noise: [*A, 1, Z] and [*A, Z, Z] for all of them, or [*A, N, Z] and [*A, N, Z, Z].
     """
 
     rows: Tensor
@@ -250,15 +270,15 @@ class _Group(NamedTuple):
     @property
     def shares_gain(self) -> bool:
         """Return whether all frames have one gain."""
-        return self.mask.ndim == 1
+        return self.noise.ndim == self.z.ndim
 
 
 def _groups(
-    model: MixtureKalmanFilter, frames: Measurements, at_a_time: int, wanted: Wanted = _ALL
+    model: Tracks, frames: Measurements, at_a_time: int, wanted: Wanted = _ALL
 ) -> Iterator[_Group]:
     """Yield frames that measure the same dimensions with the same noise, which share their gains."""
-    z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
-    noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
+    z, mask = frames.z.flatten(-3, -2), frames.mask.flatten(-3, -2)
+    noise = None if frames.cov.ndim < frames.z.ndim else frames.cov.flatten(-4, -3)
     if not values_visible():
         each = frames.cov.expand(len(z), -1, -1) if noise is None else noise
         yield _Group(torch.arange(len(z), device=z.device), z, mask, each)
@@ -269,39 +289,49 @@ def _groups(
         return
     for same in alike:
         first = 0 if len(alike) == 1 else int(same[0])
-        own_noise = frames.cov if noise is None else noise[first]
+        own_noise = frames.cov if noise is None else noise[..., first, :, :]
+        own_mask = mask[..., first : first + 1, :]
         for rows in same.split(at_a_time):
-            yield _Group(rows, z[rows], mask[first], own_noise)
+            own = z if len(rows) == z.shape[-2] and len(alike) == 1 else z.index_select(-2, rows)
+            yield _Group(rows, own, own_mask, own_noise)
 
 
-def _alike(mask: Bool[Tensor, "N Z"], noise: Float[Tensor, "N Z Z"] | None) -> Sequence[Tensor]:
+def _alike(
+    mask: Bool[Tensor, "*A N Z"], noise: Float[Tensor, "*A N Z Z"] | None
+) -> Sequence[Tensor]:
     """Return the rows of frames that measure the same dimensions with the same noise, set by set."""
-    settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
-    if len(mask) == 1 or bool((settings == settings[:1]).all()):
-        return [torch.arange(len(mask), device=mask.device)]
+    n_rows = mask.shape[-2]
+    if n_rows == 1:
+        return [torch.arange(1, device=mask.device)]
+    settings = mask.movedim(-2, 0).flatten(1)
+    if noise is not None:
+        settings = torch.cat([settings.to(noise), noise.movedim(-3, 0).flatten(1)], 1)
+    if bool((settings == settings[:1]).all()):
+        return [torch.arange(n_rows, device=mask.device)]
     _, group = torch.unique(settings, dim=0, return_inverse=True)
     return group.argsort(stable=True).split(torch.bincount(group).tolist())
 
 
 def _pays(
-    model: MixtureKalmanFilter,
-    noise: Float[Tensor, "N Z Z"],
-    mask: Bool[Tensor, "N Z"],
+    model: Tracks,
+    noise: Float[Tensor, "*A N Z Z"],
+    mask: Bool[Tensor, "*A N Z"],
     n_different: int,
     wanted: Wanted,
 ) -> bool:
     """Return whether frames with noise of their own gain by making the gains that some of them share."""
     if noise.requires_grad:
         return False
-    if len(noise) == 1:
-        return _kept_gains(model, wanted).is_asked_again(noise[0], mask[0])
-    return n_different <= len(noise) / _LEAST_SHARE
+    if mask.shape[-2] == 1:
+        return _kept_gains(model, wanted).is_asked_again(noise, mask)
+    return n_different <= mask.shape[-2] / _LEAST_SHARE
 
 
 def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
     """Yield frames that have gains of their own, some at a time."""
-    for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
-        yield _Group(rows, z[rows], mask[rows], noise[rows])
+    for rows in torch.arange(z.shape[-2], device=z.device).split(_OWN_FRAMES):
+        own = z[..., rows, :], mask[..., rows, :], noise[..., rows, :, :]
+        yield _Group(rows, *own)
 
 
 def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, "N M"]:
@@ -316,8 +346,8 @@ class _Conditioned(NamedTuple):
     """Holds the components given N frames that share their gains.
 
     Attributes:
-        means: [N, M, D]. log_likelihood: [N, M]. jitter: [N, M], or None.
-        log_context: the log-likelihood of the first measurements alone, [N, M], or None.
+        means: [*A, N, M, D]. log_likelihood: [*A, N, M]. jitter: [*A, N, M], or None.
+        log_context: the log-likelihood of the first measurements alone, [*A, N, M], or None.
     """
 
     means: Tensor
@@ -327,7 +357,7 @@ class _Conditioned(NamedTuple):
 
 
 def _condition(
-    model: MixtureKalmanFilter,
+    model: Tracks,
     shared: MeasuredParts,
     group: _Group,
     made: "_SharedGain",
@@ -337,32 +367,39 @@ def _condition(
     gain = made.gain
     white = _whitened(shared, group, gain)
     squares = white.square()
-    means = torch.baddbmm(shared.means.to(model.dtype)[:, None], white.mT, gain.white)
-    jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
-    context = _log_density(made.context_norm, squares[:, :n_context]) if n_context else None
-    likelihood = _log_density(gain.log_norm, squares)
-    return _Conditioned(means.transpose(0, 1), likelihood, jitter, context)
+    centres = shared.means.to(model.dtype)
+    moves = (part.flatten(0, -3) for part in (white.mT, gain.white))
+    means = torch.baddbmm(centres.flatten(0, -2)[:, None], *moves)
+    # frame by frame in memory, for the sums over components that follow
+    means = means.view(*white.shape[:-2], *means.shape[1:]).transpose(-3, -2).contiguous()
+    jitter = None
+    if gain.jitter is not None:
+        jitter = gain.jitter[..., None, :].expand(means.shape[:-1])
+    context = _log_density(made.context_norm, squares[..., :n_context, :]) if n_context else None
+    return _Conditioned(means, _log_density(gain.log_norm, squares), jitter, context)
 
 
-def _whitened(shared: MeasuredParts, group: _Group, gain: Gain) -> Float[Tensor, "M Z N"]:
+def _whitened(shared: MeasuredParts, group: _Group, gain: Gain) -> Float[Tensor, "*A M Z N"]:
     """Return the innovations over their standard deviations."""
-    residual = (group.z[:, None] - shared.centre.to(group.z)) * group.mask
-    return torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
+    centre = shared.centre.to(group.z)
+    residual = (group.z[..., None, :] - centre[..., None, :, :]) * group.mask[..., None, :]
+    return torch.linalg.solve_triangular(gain.factor, residual.movedim(-3, -1), upper=False)
 
 
 def _log_density(
-    log_norm: Float[Tensor, " M"], squares: Float[Tensor, "M Z N"]
-) -> Float[Tensor, "N M"]:
+    log_norm: Float[Tensor, "*A M"], squares: Float[Tensor, "*A M Z N"]
+) -> Float[Tensor, "*A N M"]:
     """Return the log-density of innovations, of which the squares of whitened ones are given."""
-    return log_norm[:, None].sub(squares.sum(1), alpha=0.5).mT
+    return log_norm[..., None].sub(squares.sum(-2), alpha=0.5).mT
 
 
 class _SharedGain(NamedTuple):
     """Holds what frames with the same noise and the same gaps share.
 
     Attributes:
-        gain: of every component. covs: the covariances after the update, [M, D, D].
-        context_norm: the log of the normaliser of the first measurements' density, [M].
+        gain: of every component. covs: the covariances after the update, [*A, M, D, D], or
+            [*A, M, P, 3, 3] of points.
+        context_norm: the log of the normaliser of the first measurements' density, [*A, M].
     """
 
     gain: Gain
@@ -370,7 +407,7 @@ class _SharedGain(NamedTuple):
     context_norm: Tensor
 
 
-def _gain(model: MixtureKalmanFilter, group: _Group, wanted: Wanted) -> _SharedGain:
+def _gain(model: Tracks, group: _Group, wanted: Wanted) -> _SharedGain:
     """Return gain and covariance of every component for frames that share them, kept for later."""
     kept = _kept_gains(model, wanted)
     found = kept.get(group.noise, group.mask)
@@ -381,17 +418,34 @@ def _gain(model: MixtureKalmanFilter, group: _Group, wanted: Wanted) -> _SharedG
     return found
 
 
-def _kept_gains(model: MixtureKalmanFilter, wanted: Wanted) -> "_FrameGains":
+def _kept_gains(model: Tracks, wanted: Wanted) -> "_FrameGains":
     sources = (model.means, model.covariances)
     return derived(model, ("frame gains", model.dtype, wanted), sources, _FrameGains)
 
 
-def _make_gain(model: MixtureKalmanFilter, group: _Group, wanted: Wanted) -> _SharedGain:
+def _make_gain(model: Tracks, group: _Group, wanted: Wanted) -> _SharedGain:
+    if isinstance(model, SideBySide):  # one of them may have had its part before
+        groups = (_Group(group.rows, *parts) for parts in zip(*group[1:], strict=True))
+        pairs = zip(model.filters, groups, strict=True)
+        return _gains_of_all([_gain(own, part, wanted) for own, part in pairs])
     gain, covs = kalman_gain(
         model.covariances, group.noise, model.observed, group.mask, wanted.columns
     )
+    covs = point_blocks(covs).contiguous() if wanted.of_points else covs
     norm = log_normaliser(gain.factor, group.mask, wanted.n_context).to(model.dtype)
     return _SharedGain(gain.to(model.dtype), covs, norm)
+
+
+def _gains_of_all(made: Sequence[_SharedGain]) -> _SharedGain:
+    """Return the gains of filters side by side."""
+    gains, covs, norms = zip(*made, strict=True)
+    jitters = [gain.jitter for gain in gains]
+    jitter = None
+    if any(found is not None for found in jitters):
+        none = torch.zeros_like(gains[0].log_norm)
+        jitter = stacked([none if found is None else found for found in jitters])
+    factor, white, log_norm = map(stacked, zip(*(gain[:3] for gain in gains), strict=True))
+    return _SharedGain(Gain(factor, white, log_norm, jitter), stacked(covs), stacked(norms))
 
 
 class _FrameGains:
@@ -431,13 +485,13 @@ class _FrameGains:
 
 
 def _key(noise: Tensor, mask: Tensor) -> tuple[Any, ...]:
-    return (*mask.tolist(), *noise.detach().flatten().tolist())
+    return (*mask.flatten().tolist(), *noise.detach().flatten().tolist())
 
 
 def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Return the values of all frames in the order of the frames."""
+    """Return the values of all frames in the order of the frames, filter by filter."""
     if len(parts) == 1:  # of all frames, in their order
         return parts[0][1]
     rows = torch.cat([rows for rows, _ in parts])
-    values = torch.cat([values for _, values in parts])
-    return values.index_select(0, rows.argsort())
+    values = torch.cat([values.unflatten(0, (-1, len(rows))) for rows, values in parts], 1)
+    return values.index_select(1, rows.argsort()).flatten(0, 1)

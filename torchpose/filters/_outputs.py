@@ -126,11 +126,15 @@ def finish_output(
     mean: Float[Tensor, "B T D"],
     log_weights: Float[Tensor, "B T M"],
     log_evidence: Float[Tensor, "B T"],
-    cov: Float[Tensor, "B T D D"] | None,
+    cov: Float[Tensor, "B T *blocks"] | None,
     lengths: Int[Tensor, " B"],
     work: Mending,
+    n_filters: int = 1,
 ) -> FilterOutput:
-    """Repeat the last estimate past each length, and report the elements that degenerated."""
+    """Repeat the last estimate past each length, and report the elements that degenerated.
+
+    Of filters side by side the estimates of each follow those of the one before.
+    """
     batch, n_frames = log_evidence.shape
     frames = torch.arange(n_frames, device=mean.device)
     if not values_visible() or bool((lengths < n_frames).any()):
@@ -147,7 +151,7 @@ def finish_output(
         lost = (frames >= failed_at[:, None]) & failed[:, None]
         log_weights = log_weights.masked_fill(lost[..., None], float("nan"))
         if values_visible():
-            _warn_of_failures(failed_at)
+            _warn_of_failures(failed_at.unflatten(0, (n_filters, -1)))
     return FilterOutput(mean, log_weights, log_evidence, cov, failed_at, *work)
 
 
@@ -158,7 +162,10 @@ def first_not_finite(values: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
     return torch.where(bad.any(1), first, -1)
 
 
-def _warn_of_failures(failed_at: Int[Tensor, " B"]) -> None:
+def _warn_of_failures(failed_at: Int[Tensor, "A B"]) -> None:
+    never = torch.iinfo(failed_at.dtype).max
+    first = torch.where(failed_at >= 0, failed_at, never).amin(0)
+    failed_at = first.masked_fill(first == never, -1)
     failed = torch.nonzero(failed_at >= 0).reshape(-1).tolist()
     listed = ", ".join(f"element {b} at frame {int(failed_at[b])}" for b in failed[:8])
     warnings.warn(

@@ -70,10 +70,19 @@ def within_and_between(weights: Tensor, mean: Tensor, estimate: Tensor, cov: Ten
     Args:
         weights: w [B, M]. mean: m_j [B, M, D]. estimate: m [B, D]. cov: P [M, D, D] or [B, M, D, D].
     """
-    spread = (mean - estimate[:, None]) * weights[..., None].sqrt()
     flat = cov.flatten(-2).to(weights.dtype)
     within = weights @ flat if cov.ndim == 3 else (weights[:, None] @ flat)[:, 0]
-    return within.unflatten(-1, cov.shape[-2:]) + spread.mT @ spread
+    return within.unflatten(-1, cov.shape[-2:]) + between(weights, mean, estimate)
+
+
+def between(
+    weights: Float[Tensor, "*batch M"],
+    mean: Float[Tensor, "*batch M D"],
+    estimate: Float[Tensor, "*batch D"],
+) -> Float[Tensor, "*batch D D"]:
+    """Return sum_j w_j (m_j - m)(m_j - m)^T; see `within_and_between`."""
+    spread = (mean - estimate[..., None, :]) * weights[..., None].sqrt()
+    return spread.mT @ spread
 
 
 def step_weights(

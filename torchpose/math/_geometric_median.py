@@ -3,17 +3,18 @@
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 _STEPS = 5
 _LEAST = 1e-18  # of a spread, where a mean that has none is hit
 
 
 def geometric_median(
-    weights: Float[Tensor, "N M"],
-    means: Float[Tensor, "N M P 3"],
-    spread: Float[Tensor, "*batch M P"],
-    start: Float[Tensor, "N P 3"],
-) -> Float[Tensor, "N P 3"]:
+    weights: Float[Tensor, "*batch M"],
+    means: Float[Tensor, "*batch M P 3"],
+    spread: Float[Tensor, "*#batch M P"],
+    start: Float[Tensor, "*batch P 3"],
+) -> Float[Tensor, "*batch P 3"]:
     """Return the points x of least sum_j w_j sqrt(|x - m_j|^2 + tr C_j), by Weiszfeld's iteration.
 
     The root is the expected distance from x to N(m_j, C_j), from above (Jensen). Where the mixture
@@ -21,19 +22,18 @@ def geometric_median(
     Five steps are made, and gradients are theirs.
 
     Args:
-        weights: w. means: m. spread: tr C, with or without a batch. start: x to begin with.
+        weights: w. means: m. spread: tr C. start: x to begin with.
 
     Reference:
         E. Weiszfeld, "Sur le point pour lequel la somme des distances de n points donnés est
         minimum" (1937).
     """
     # sqrt(|x - m|^2 + tr C) is the distance in one dimension more
-    away = spread.mT.clamp_min(_LEAST).sqrt().expand(len(means), -1, -1)[..., None]
-    offsets = (means - start[:, None]).transpose(1, 2)  # cancels less
-    points, flat = (
-        torch.cat([offsets, last], -1).flatten(0, 1) for last in (away, torch.zeros_like(away))
-    )
-    shares = weights[:, None, None].expand(-1, offsets.shape[1], -1, -1).flatten(0, 1)
+    offsets = (means - start[..., None, :, :]).transpose(-3, -2)  # cancels less
+    away = spread.mT.clamp_min(_LEAST).sqrt().expand(offsets.shape[:-1])[..., None]
+    points = torch.cat([offsets, away], -1).flatten(0, -3)
+    flat = pad(offsets, (0, 1)).flatten(0, -3)
+    shares = weights[..., None, :].expand(offsets.shape[:-1]).flatten(0, -2)[:, None]
     x = torch.zeros_like(flat[:, :1])
     for _ in range(_STEPS):
         pull = shares / torch.cdist(x, points, compute_mode="donot_use_mm_for_euclid_dist")
@@ -47,12 +47,12 @@ def median_columns(points: Int[Tensor, " P"]) -> Int[Tensor, "P 3"]:
 
 
 def with_medians(
-    mean: Float[Tensor, "N D"],
-    weights: Float[Tensor, "N M"],
-    means: Float[Tensor, "N M P 3"],
-    variances: Float[Tensor, "*batch M P 3"],
+    mean: Float[Tensor, "*batch D"],
+    weights: Float[Tensor, "*batch M"],
+    means: Float[Tensor, "*batch M P 3"],
+    variances: Float[Tensor, "*#batch M P 3"],
     columns: Int[Tensor, "P 3"],
-) -> Float[Tensor, "N D"]:
+) -> Float[Tensor, "*batch D"]:
     """Return the mean of a mixture with geometric medians in place of the means of its points.
 
     Args:
@@ -60,5 +60,5 @@ def with_medians(
         columns: the three dimensions of each point (`median_columns`).
     """
     spread = variances.sum(-1).to(means.dtype)
-    found = geometric_median(weights, means, spread, mean[:, columns])
+    found = geometric_median(weights, means, spread, mean[..., columns])
     return mean.index_copy(-1, columns.flatten(), found.flatten(-2))

@@ -162,7 +162,8 @@ class Estimates(NamedTuple):
 
     Attributes:
         left, right: the states of each arm with covariances, float64; the first 21 dimensions are those
-            of `torchpose.priors._arm_state`.
+            of `torchpose.priors._arm_state`. If more follow, which are joints in the axes of the torso,
+            covariances are those of each three dimensions alone, [B, T, 12, 3, 3].
         view: the virtual camera in whose pixels the states are; None is the prior's camera.
         poses: by estimators that do not estimate the states of single arms; no motion stage follows. Else
             None.

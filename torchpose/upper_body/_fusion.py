@@ -17,7 +17,6 @@ from torchpose._core.module_state import derived, index_tensor, outside_inferenc
 from torchpose.camera._projection import (
     arm_in_body_frame,
     join_arms,
-    joint_blocks,
     lift,
     pixel_covariances,
 )
@@ -56,15 +55,16 @@ def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: Rotation
     outputs, view = estimates[:2], estimates.view
     mean = torch.stack([out.mean for out in outputs], 2)  # both arms: [B, T, 2, D]
     cov = torch.stack([require_cov(out) for out in outputs], 2)
-    state, state_cov = mean[..., :STATE_DIM], cov[..., :STATE_DIM, :STATE_DIM]
     if mean.shape[-1] > STATE_DIM:
         uv, joints, joint_covs = _on_torso(mean, cov, matrix, order)
+        uv_covs = cov[..., :5, :2, :2]
     else:
-        lifted = arm_in_body_frame(state, state_cov, matrix, order)
-        seen = state[..., :15].unflatten(-1, (5, 3))
+        lifted = arm_in_body_frame(mean, cov, matrix, order)
+        seen = mean[..., :15].unflatten(-1, (5, 3))
         uv, joints, joint_covs = (_joined(values) for values in (seen, *lifted))
-    angles, place = state[..., 15:].mean(2).split(3, -1)
-    uv, uv_covs = uv[..., :2], _joined(pixel_covariances(state_cov))
+        uv_covs = pixel_covariances(cov)
+    angles, place = mean[..., 15:STATE_DIM].mean(2).split(3, -1)
+    uv, uv_covs = uv[..., :2], _joined(uv_covs)
     if view is not None:
         back = view.rotation.mT
         angles = matrix_to_euler(back @ euler_to_matrix(angles, order), order)
@@ -81,7 +81,7 @@ def _joined(arms: Float[Tensor, "B T 2 5 *rest"]) -> Float[Tensor, "B T 8 *rest"
 
 def _on_torso(
     mean: Float[Tensor, "B T 2 36"],
-    cov: Float[Tensor, "B T 2 36 36"],
+    cov: Float[Tensor, "B T 2 12 3 3"],
     matrix: Tensor,
     order: RotationOrder,
 ) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
@@ -94,7 +94,7 @@ def _on_torso(
     angles, place = camera.unbind(-2)
     lifted = lift(seen, matrix, euler_to_matrix(angles, order), place)
     uv, pose, joints = _joined(torch.cat([seen, own, lifted], -1)).split(3, -1)
-    covs = _joined(joint_blocks(cov[..., STATE_DIM:, STATE_DIM:]))
+    covs = _joined(cov[..., STATE_DIM // 3 :, :, :])
     return uv, *onto_torso(pose, covs, joints)
 
 

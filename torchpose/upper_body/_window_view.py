@@ -31,13 +31,13 @@ class SeenInView(NamedTuple):
 
     Attributes:
         measured: the eight joints of each frame.
-        hands: values and mask [B, T, 2 H] of the hands of each frame's window, for both arms.
+        hands: pixels [B, T, 2, H, 2] and mask [B, T, 2, H] of the hands of each frame's window, of both arms.
         view: the virtual camera of each frame.
         log_scale: the log of the area that a pixel of the camera has in the virtual one, [B, T, 8].
     """
 
     measured: MeasuredJoints
-    hands: dict[str, tuple[Tensor, Tensor]]
+    hands: tuple[Tensor, Tensor]
     view: BodyView
     log_scale: Tensor
 
@@ -101,8 +101,7 @@ def see_in_view(
     view = view_body(neck, height, model, matrix, reach)
     seen, log_scale = to_view(torch.cat([uv, carried], 2), view, matrix)
     now, hands = seen.split([uv.shape[2], carried.shape[2]], 2)
-    of_arms = hands.flatten(2).chunk(2, 2), known.repeat_interleave(2, 2).chunk(2, 2)
-    windows = dict(zip(ARMS, zip(*of_arms, strict=True), strict=True))
+    windows = hands.unflatten(2, (len(ARMS), -1)), known.unflatten(2, (len(ARMS), -1))
     now = torch.where(mask[..., None], now, 0.0)
     cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
     return SeenInView(MeasuredJoints(now, mask, cov), windows, view, log_scale[..., : uv.shape[2]])

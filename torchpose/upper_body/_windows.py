@@ -5,7 +5,8 @@ Mixtures over windows see the body through a virtual camera that follows it
 """
 
 from functools import cache
-from typing import NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,10 +16,12 @@ from torchpose._core.module_state import derived, index_tensor, outside_inferenc
 from torchpose.camera._virtual_camera import memory_frames, planes_in_view
 from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
+from torchpose.filters._frame_noise import point_blocks
 from torchpose.filters._measurements import Measurements, check_lengths
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
+from torchpose.filters._side_by_side import SideBySide
 from torchpose.math._geometric_median import median_columns
 from torchpose.math._rotations import matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
@@ -168,45 +171,52 @@ class WindowMixture(Estimator):
         """Return the estimates of frames; their evidence is that of each frame given its window."""
         (batch, n_frames), device = seen.measured.uv.shape[:2], seen.measured.uv.device
         lengths, arms, contexts = check_lengths(lengths, batch, n_frames, device), [], []
-        for side in ARMS:
-            measured = _limbs_last(joints[side])
-            model = self._filter(side, measured)
-            frames = self._frames(model, seen, side, measured, lengths)
-            point = None if absence is None else self._outside(seen, absence, side)
-            out, context = self._filtered(model, frames, measured, point, progress)
-            arms.append(in_double(out))
-            contexts.append(context)
+        measured = {side: _limbs_last(joints[side]) for side in ARMS}
+        points = {side: self._outside(seen, absence, side) for side in ARMS}
+        # of many frames with gaps, fewer have the same gaps in the windows of both arms
+        both = n_frames == 1 and len({*measured.values()}) == 1 and not any(points.values())
+        for sides in [tuple(ARMS)] if both else [(side,) for side in ARMS]:
+            own, point = measured[sides[0]], points[sides[0]]
+            model = self._filters(sides, own)
+            frames = self._frames(model, seen, sides, own, lengths)
+            out, context = self._filtered(model, frames, sides[0], own, point, progress)
+            arms += _each(in_double(out), batch)
+            contexts += context.split(batch)
         told = tuple(arm[:_N_LIMB] if self.of_limbs else arm for arm in ARMS.values())
         left, right = _beyond_context(arms, contexts, seen, told)
         return Estimates(left, right, seen.view)
 
     def _filtered(
         self,
-        model: FixedTrackFilter,
+        model: SideBySide,
         frames: Measurements,
+        side: str,
         joints: tuple[str, ...],
         point: OutsidePoint | None,
         progress: bool,
     ) -> tuple[FilterOutput, Tensor]:
-        """Return the estimates of an arm, and the evidence of what it is told beside (`_context`).
+        """Return the estimates of arms, and the evidence of what they are told beside (`_context`).
 
         They are of the arm of this frame, followed by its joints in the axes of the torso.
 
         Args:
-            model, frames: the filter and what it measures. joints: of this frame.
-            point: the evidence that the hand is outside of the image.
+            model, frames: the filters and what they measure. side: the first arm. joints: of this frame.
+            point: the evidence that the hand of a single arm is outside of the image.
         """
-        wanted = Wanted((*range(STATE_DIM), *self.layout.in_torso), self._context(joints))
-        rule, given, medians = model.weight_rule, (frames, True), model.medians
+        columns = (*range(STATE_DIM), *self.layout.in_torso)
+        wanted = Wanted(columns, self._context(joints), self.layout.torso)
+        first, rule, given = self._filter(side, joints), model.weight_rule, (frames, True)
+        medians = first.medians
         if point is None:
-            columns = _limbs_in_torso(medians.device)[: len(medians)]
-            out, context = run_with_context(model, rule, columns, *given, wanted, progress)
+            points = _limbs_in_torso(medians.device)[: len(medians)]
+            out, context = run_with_context(model, rule, points, *given, wanted, progress)
         else:
-            whole, columns = wanted._replace(columns=None), median_columns(medians)
-            out, context = run_with_context(model, rule, columns, *given, whole, progress)
-            out = with_outside_point(model, out, frames, point)
-            kept = torch.tensor(wanted.columns, device=medians.device)
+            whole, points = Wanted(None, wanted.n_context), median_columns(medians)
+            out, context = run_with_context(model, rule, points, *given, whole, progress)
+            out = with_outside_point(first, out, frames.of_filter(0), point)
+            kept = torch.tensor(columns, device=medians.device)
             cov = require_cov(out)[..., kept[:, None], kept]
+            cov = point_blocks(cov) if wanted.of_points else cov
             out = out._replace(mean=out.mean[..., kept], cov=cov)
         return out, torch.zeros_like(out.log_evidence) if context is None else context
 
@@ -215,8 +225,10 @@ class WindowMixture(Estimator):
         torso = [joint for joint in joints if joint not in _LIMBS] if self.of_limbs else []
         return 2 * (self.window.layout.n_hands + len(torso) + self.model.upright)
 
-    def _outside(self, seen: SeenInView, absence: Absence, side: str) -> OutsidePoint | None:
+    def _outside(self, seen: SeenInView, absence: Absence | None, side: str) -> OutsidePoint | None:
         """Return the evidence that an arm's hand is outside of the image, if there is any in these frames."""
+        if absence is None:
+            return None
         known = seen.measured.mask[:, :, ARMS[side][0]]
         log_inside = absence.log_inside[..., list(ARMS).index(side)].masked_fill(known, 0.0)
         if not bool((log_inside < 0).any()):
@@ -227,35 +239,55 @@ class WindowMixture(Estimator):
 
     def _frames(
         self,
-        model: FixedTrackFilter,
+        model: SideBySide,
         seen: SeenInView,
-        side: str,
+        sides: tuple[str, ...],
         joints: tuple[str, ...],
         lengths: Int[Tensor, " B"],
     ) -> Measurements:
-        """Return the hands of the window and some joints of an arm, which were checked as keypoints."""
+        """Return the hands of the window and some joints of arms, which were checked as keypoints."""
         cov = self.model.measurement_cov
-        noise = _window_noise(seen, self.window, side, joints, cov) if joints else None
-        z, mask = _window_inputs(seen, side, joints)
+        noise = _window_noise(seen, self.window, sides, joints, cov) if joints else None
+        z, mask = _window_inputs(seen, sides, joints)
         if self.model.upright:
             # roll and pitch of the virtual camera are known, and bodies of the prior are upright
             angles = matrix_to_euler(seen.view.rotation, "zxy")[..., :2]
-            z, mask = torch.cat([angles, z], -1), torch.nn.functional.pad(mask, (2, 0), value=True)
+            z = torch.cat([angles.expand(len(sides), -1, -1, -1), z], -1)
+            mask = torch.nn.functional.pad(mask, (2, 0), value=True)
             if noise is not None:
                 spread = upright_cov().to(noise)
                 noise = _blocks(spread.expand(*noise.shape[:-2], 2, 2), noise)
         z = torch.where(mask, z, 0.0).to(model.dtype)
-        return Measurements(z, mask, model.own_noise() if noise is None else noise, lengths)
+        lengths = lengths.expand(len(sides), -1)
+        return Measurements(z, mask, model.noise if noise is None else noise, lengths)
+
+    def _filters(self, sides: tuple[str, ...], joints: tuple[str, ...]) -> SideBySide:
+        """Return the filters of arms side by side; made once for their prior, noise and settings."""
+        mixtures = [getattr(self.window, side).parameters_tuple() for side in sides]
+        sources = (*chain.from_iterable(mixtures), self.model.measurement_cov)
+        return derived(
+            self.model.owner,
+            self._name(sides, joints),
+            sources,
+            lambda: self._side_by_side(sides, joints),
+        )
+
+    def _side_by_side(self, sides: tuple[str, ...], joints: tuple[str, ...]) -> SideBySide:
+        filters = [self._filter(side, joints) for side in sides]
+        return SideBySide(filters, [own.weight_rule for own in filters])
+
+    def _name(self, sides: tuple[str, ...] | str, joints: tuple[str, ...]) -> tuple[Any, ...]:
+        """Return the name that filters of these settings are kept by."""
+        settings = (*self.window.settings.items(), self.power, self.dtype, self.model.upright)
+        return self.calibration, sides, joints, self.window.layout, *settings
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> FixedTrackFilter:
         """Return the filter of an arm; made once for its prior, noise and settings."""
-        window, cov = self.window, self.model.measurement_cov
+        window, cov, upright = self.window, self.model.measurement_cov, self.model.upright
         mixture: GaussianMixture = getattr(window, side)
-        settings = (*window.settings.items(), self.power, self.dtype)
-        upright = self.model.upright
         return derived(
             self.model.owner,
-            (self.calibration, side, joints, window.layout, upright, *settings),
+            self._name(side, joints),
             (*mixture.parameters_tuple(), cov),
             lambda: _window_filter(window, side, joints, cov, self.power, self.dtype, upright),
         )
@@ -321,31 +353,35 @@ def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor
 
 
 def _window_inputs(
-    seen: SeenInView, side: str, joints: tuple[str, ...]
-) -> tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]]:
-    """Return values and mask of the hands of the window, and of some joints of an arm."""
-    rows = index_tensor(_rows(side, joints), seen.measured.uv.device)
-    hands, known = seen.hands[side]
-    z = seen.measured.uv.index_select(2, rows).flatten(-2)
-    mask = seen.measured.mask.index_select(2, rows).repeat_interleave(2, -1)
-    return torch.cat([hands, z], -1), torch.cat([known, mask], -1)
+    seen: SeenInView, sides: tuple[str, ...], joints: tuple[str, ...]
+) -> tuple[Float[Tensor, "A B T Z"], Bool[Tensor, "A B T Z"]]:
+    """Return values and mask of the hands of the window, and of some joints of arms."""
+    rows = index_tensor(_rows_of_arms(sides, joints), seen.measured.uv.device)
+    first = list(ARMS).index(sides[0])
+    arms = slice(first, first + len(sides))
+    parts = zip(seen.hands, (seen.measured.uv, seen.measured.mask), strict=True)
+    z, mask = (
+        torch.cat([hands[:, :, arms], own.index_select(2, rows).unflatten(2, (len(sides), -1))], 3)
+        for hands, own in parts
+    )
+    return z.flatten(-2).movedim(2, 0), mask.repeat_interleave(2, -1).movedim(2, 0)
 
 
 def _window_noise(
     seen: SeenInView,
     window: WindowPrior,
-    side: str,
+    sides: tuple[str, ...],
     joints: tuple[str, ...],
     measurement_cov: Float[Tensor, "8 2 2"],
 ) -> Tensor | None:
     """Return R of `_window_inputs`; None where it is that of the filter."""
     if seen.measured.cov is measurement_cov:
         return None
-    rows = index_tensor(_rows(side, joints), seen.measured.cov.device)
-    own = seen.measured.cov.index_select(-3, rows)
-    hand = _hand_cov(window, side, measurement_cov)
-    hands = hand.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
-    return block_diagonal(torch.cat([hands, own], -3))
+    rows = index_tensor(_rows_of_arms(sides, joints), seen.measured.cov.device)
+    own = seen.measured.cov.index_select(-3, rows).unflatten(-3, (len(sides), -1))
+    hands = torch.stack([_hand_cov(window, side, measurement_cov) for side in sides])[:, None]
+    hands = hands.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
+    return block_diagonal(torch.cat([hands, own], -3)).movedim(-3, 0)
 
 
 def _blocks(first: Float[Tensor, "*batch N N"], last: Float[Tensor, "*batch M M"]) -> Tensor:
@@ -371,6 +407,18 @@ def _limbs_in_torso(device: torch.device) -> Int[Tensor, "P 3"]:
 def _rows(side: str, joints: tuple[str, ...]) -> tuple[int, ...]:
     """Return which of the eight joints these of an arm are."""
     return tuple(ARMS[side][ARM_JOINTS.index(joint)] for joint in joints)
+
+
+def _rows_of_arms(sides: tuple[str, ...], joints: tuple[str, ...]) -> tuple[int, ...]:
+    """Return which of the eight joints these of some arms are, arm by arm."""
+    return tuple(row for side in sides for row in _rows(side, joints))
+
+
+def _each(out: FilterOutput, batch_size: int) -> list[FilterOutput]:
+    """Return the estimates of each of some filters that ran side by side."""
+    parts = ([None] * (len(out.mean) // batch_size) if value is None else value.split(batch_size)
+             for value in out)  # fmt: skip
+    return [FilterOutput(*values) for values in zip(*parts, strict=True)]
 
 
 def _beyond_context(
