@@ -28,7 +28,7 @@ _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose h
 # Exponent of what later frames say of an arm whose hand is measured: they err as the frame itself does.
 _LATER = 0.25
 _RATE = 30.0
-_NOTHING = -60.0
+_NOTHING = -45.0  # nats relative to the broad part of the prior
 _LEAST = 1e-30  # density
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 # Directions, and arms of which all pairs of directions are compared, at a time: so that intermediate
@@ -134,9 +134,10 @@ class DirectionDensity:
         self._first = torch.cat([first, alone])
         self._second = torch.cat([second, torch.full_like(alone, dim)])
         slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
-        self.broad = slopes.new_tensor(math.log(prior.broad) - 2 * math.log(4 * math.pi))
+        log_broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
+        self._broad, self._nothing = math.exp(log_broad), log_broad + _NOTHING
         self._slopes_of_all = pad(slopes, (0, 1))
-        self._slopes_of_all[-1, -1] = self.broad
+        self._slopes_of_all[-1, -1] = log_broad
         self._slopes_of_upper, self._slopes_of_lower = _by_bone(-0.5 * precision, pulled, constant)
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
@@ -157,8 +158,7 @@ class DirectionDensity:
         count, columns = max(1, _ROWS // lowers), rows.mT.contiguous()
         pairs = zip(upper.split(count), columns.split(count * lowers, 1), strict=True)
         known = torch.cat([self._known(*pair) for pair in pairs])
-        found = torch.logaddexp(known, self.broad).to(directions.dtype)
-        return found.view(directions.shape[:-1])
+        return (known + self._broad).log().to(directions.dtype).view(directions.shape[:-1])
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
@@ -175,8 +175,8 @@ class DirectionDensity:
 
     def _known(
         self, upper: Float[Tensor, "U K"], columns: Float[Tensor, "7 N"]
-    ) -> Float[Tensor, "N 1"]:
-        """Return the log-density of the mixture, without its broad part; exponentials are float32.
+    ) -> Float[Tensor, " N"]:
+        """Return the density of the mixture, without its broad part.
 
         Args:
             upper: the polynomials' terms of the upper arms alone.
@@ -186,10 +186,8 @@ class DirectionDensity:
         logs = upper.repeat_interleave(columns.shape[1] // len(upper), 0).addmm_(
             terms.mT, self._slopes_of_lower
         )
-        most = logs.detach().amax(-1, keepdim=True)
-        # exp of what is far below is slow where it is denormal, and adds nothing
-        near = logs.sub_(most).float().clamp_min_(_NOTHING).exp_()
-        return near.sum(-1, keepdim=True).log() + most
+        # exp of what is far below the broad part is slow where it is denormal, and adds nothing
+        return logs.clamp_min_(self._nothing).exp_().sum(-1)
 
 
 class ArmChain:
