@@ -340,6 +340,23 @@ def test_the_two_orders_of_25_keypoints_are_told_apart(tmp_path, layout, behind)
     assert read_keypoints(tmp_path / "json").names == tuple(names)
 
 
+@pytest.mark.parametrize("layout", ["BODY_25", "BODY_25B"])
+def test_noise_does_not_hide_the_order_of_an_upper_body(tmp_path, layout):
+    names = SKELETONS["openpose-25"].joints if layout == "BODY_25" else _BODY_25B
+    places = _STANDING | {
+        "LElbow": (65, -35), "RElbow": (-65, -35), "LWrist": (45, -85), "RWrist": (-45, -85),
+    }  # fmt: skip
+    generator = np.random.default_rng(0)
+    for number in range(20):
+        flat = []
+        for name in names:
+            seen = not name.endswith(("Hip", "Knee", "Ankle", "Toe", "Heel"))
+            x, y = generator.normal(places.get(name, (0, 0)), 11)
+            flat += [500.0 + x, 300.0 + y, 0.7] if seen else [0.0, 0.0, 0.0]
+        frame(tmp_path / "json", number, {"pose_keypoints_2d": flat})
+    assert read_keypoints(tmp_path / "json").names == tuple(names)
+
+
 def test_the_most_confident_person_is_followed(tmp_path):
     folder = tmp_path / "json"
     frame(folder, 0)

@@ -187,16 +187,18 @@ def _is_body_25b(people: np.ndarray) -> bool:
     """Return whether keypoints [P, 25, 3] are in the order of BODY_25B.
 
     BODY_25 has its neck in the middle of the shoulders and a middle of the hips. In the other order what has
-    these places is scattered over the body, or missing in a view from behind.
+    these places is scattered over the body, or missing in a view from behind. Noise is a large share of an
+    upper body alone, so the other order has to fit better, too.
     """
     if people.shape[1] != len(_BODY_25B):
         return False
     pixels = np.where(people[..., 2:] > 0, people[..., :2], np.nan)
     off = [_off_middle(pixels, _LAYOUTS[25], *pair) for pair in _MIDDLES.items()]
     known = [value for value in off if value is not None]
-    if known:
-        return float(np.mean(known)) > _OFF_MIDDLE
     other = _off_middle(pixels, _BODY_25B, "Neck", "Shoulder")
+    if known:
+        away = float(np.mean(known))
+        return away > _OFF_MIDDLE and (other is None or other < away)
     return other is not None and other < _OFF_MIDDLE
 
 
