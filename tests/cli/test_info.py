@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.cli.conftest import keypoints
+from tests.io.skeleton_files import ntu_text, person, to_kinect
 from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera
 from torchpose.io import write_keypoints
@@ -14,6 +15,7 @@ from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditional
 from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors._actions.action_file import ActionInfo
 from torchpose.priors._limb_conditionals import in_body_frame
+from torchpose.skeleton._joint_sets import SKELETONS
 from torchpose.whole_body import BodyTrack
 
 
@@ -63,6 +65,18 @@ def test_recordings_and_cameras(torchpose, files, tmp_path):
     PinholeCamera(600, 610, 330, 250, name="door").save(tmp_path / "cameras.toml")
     done = torchpose("info", tmp_path / "cameras.toml")
     assert done.out == "door  f = (600, 610), centre (330, 250) pixels\n"
+
+
+def test_recordings_of_every_layout(torchpose, tmp_path):
+    names = SKELETONS["kinect-v2-25"].joints
+    joints = to_kinect(person(names))
+    table = ["frame," + ",".join(f"{name}_{axis}" for name in names for axis in "xyz")]
+    table += [f"{t},{','.join(map(str, row.ravel()))}" for t, row in enumerate(joints)]
+    (tmp_path / "table.csv").write_text("\n".join(table))
+    (tmp_path / "a.skeleton").write_text(ntu_text({"7": dict(enumerate(joints))}, len(joints)))
+    for what in ("table.csv", "a.skeleton"):
+        done = torchpose("info", tmp_path / what)
+        assert done.code == 0 and "6 (" in done.out and "kinect-v2-25" in done.out
 
 
 def test_what_body_trackers_learn(torchpose, tmp_path):

@@ -151,6 +151,14 @@ def test_only_persons_whom_files_name_are_scored(tmp_path, monkeypatch):
     assert list(persons_module.by_person([one, other])) == ["a#s1", "b#s1"]
 
 
+def test_mirrored_recordings_are_said(tmp_path):
+    for name, factor in (("a", 1.0), ("b", -1.0)):
+        joints = poses(8, 0).numpy() * [factor, 1, 1]
+        np.savez(tmp_path / f"{name}.npz", joints=joints, names=UPPER_BODY, subject=name)
+    [note] = persons_module.read_known_persons(tmp_path).notes
+    assert note.startswith("In 1 of 2 recordings:") and "mirrored" in note
+
+
 def test_copies_under_two_persons_are_refused(data, tmp_path):
     """Else what is tested is in the training."""
     home = shutil.copytree(data / "kinect_utd_mhad", tmp_path / "home")

@@ -104,6 +104,12 @@ def test_an_unknown_set_needs_axes(tmp_path):
     assert read_recording(path, axes="camera")[0].skeleton == ""
 
 
+def test_mirrored_joints_are_said(tmp_path):
+    for name, factor, told in (("right", 1, 0), ("mirrored", -1, 1)):
+        [read] = read_recording(write(tmp_path / f"{name}.npz", joints=pose() * [factor, 1, 1]))
+        assert sum("mirrored" in note for note in read.notes) == told
+
+
 def test_a_joint_with_one_coordinate_missing_is_missing(tmp_path):
     joints = pose()
     joints[1, 2, 0] = math.nan

@@ -21,6 +21,7 @@ torchpose info limbs.safetensors
 torchpose info result/poses.npz
 torchpose info keypoints.csv"""
 
+_RECORDINGS = (".csv", ".txt", ".json", ".skeleton", ".bvh", ".c3d")
 _SNIFFED = 65536  # characters of a table that tell what it is
 _NAME = 60  # characters of what stands on the left
 
@@ -88,9 +89,7 @@ def _describe(what: str) -> str:
         return _describe_npz(path)
     if path.is_dir() and not any(path.glob("*_keypoints.json")):
         return _describe_recordings(path)
-    if path.suffix in (".yaml", ".yml"):
-        return _describe_recordings(path)
-    if path.suffix == ".csv" and not _starts_as_keypoints(path):
+    if _holds_recordings(path):
         return _describe_recordings(path)
     from torchpose.io._keypoints import read_keypoints
 
@@ -258,6 +257,18 @@ def _describe_cameras(path: Path) -> str:
     from torchpose.cli._track_output import camera_text
 
     return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})
+
+
+def _holds_recordings(path: Path) -> bool:
+    """Return whether a file that is no .npz is to be read as recordings; tables of keypoints look alike."""
+    from torchpose.io._recordings import looks_recorded
+
+    suffix = path.suffix.lower()
+    if suffix in (".yaml", ".yml"):
+        return True
+    if suffix == ".csv" and not _starts_as_keypoints(path):
+        return True
+    return suffix in _RECORDINGS and looks_recorded(path)
 
 
 def _starts_as_keypoints(path: Path) -> bool:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.io._recordings import Recording, read_recordings
+from torchpose.io._recordings import BACK_TO_CAMERA, Recording, read_recordings
 from torchpose.learning._curation.joints import measured, runs
 from torchpose.learning._curation.splits import same_names
 
@@ -70,7 +70,10 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
         f"Other people in {', '.join(files)} are left out ({len(others)} recordings): nobody says who "
         "they are."
     ] * bool(others)
-    return KnownPersons(known, notes + [f"{note}." for note in same_names(known)])
+    notes += [f"{note}." for note in same_names(known)]
+    turned = [r for r in known if BACK_TO_CAMERA in r.notes]
+    notes += [f"In {len(turned)} of {len(known)} recordings: {BACK_TO_CAMERA}."] * bool(turned)
+    return KnownPersons(known, notes)
 
 
 def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:

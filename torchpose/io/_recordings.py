@@ -4,8 +4,9 @@ Joints come back in camera axes and metres; see `torchpose.io._formats.axes`. On
 format reads a file; here its contents are checked and converted.
 """
 
+import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +17,13 @@ from torch import Tensor
 from torchpose._core.checks import check_rate
 from torchpose._core.reading import npz_keys, reading, require_file
 from torchpose.errors import FileFormatError, InputError, SkeletonError
-from torchpose.io._formats.axes import axes_rotation, body_unit, check_upright, default_axes
+from torchpose.io._formats.axes import (
+    axes_rotation,
+    body_unit,
+    check_upright,
+    default_axes,
+    heading,
+)
 from torchpose.io._formats.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
 from torchpose.io._formats.mocap_files import read_bvh, read_c3d
 from torchpose.io._formats.raw_recording import (
@@ -42,8 +49,14 @@ _READERS: dict[str, Callable[[Path], list[RawRecording]]] = {
 }
 _SUFFIXES = tuple(_READERS)
 _SNIFFED = 65536  # bytes from the start of a file that tell whether it is a recording
+BACK_TO_CAMERA = (
+    "by the shoulders the person's back is to the camera; if it is not, the joints are mirrored, or left and "
+    "right exchanged"
+)
+"""The note on a recording of joints that are perhaps mirrored."""
 _BESIDE_BODY = 0.3  # of its size: how far outside its other joints a centred body's origin may be
 _SHOWN_JOINTS = 3
+_BACK = 2 * math.pi / 3  # of the mean heading, from where on the back is to the camera
 _FAR = 1e9  # in the unit of the file; no joint is there
 
 
@@ -227,7 +240,7 @@ def _recordings_in(folder: Path) -> list[Path]:
     archives = [p for p in files if p.suffix.lower() == ".npz" and _may_hold_joints(p)]
     if archives:
         return archives
-    return [p for p in files if p.suffix.lower() in _SUFFIXES[1:] and _looks_recorded(p)]
+    return [p for p in files if p.suffix.lower() in _SUFFIXES[1:] and looks_recorded(p)]
 
 
 def _may_hold_joints(path: Path) -> bool:
@@ -237,7 +250,12 @@ def _may_hold_joints(path: Path) -> bool:
         return True  # reading it gives the error
 
 
-def _looks_recorded(path: Path) -> bool:
+def looks_recorded(path: Path) -> bool:
+    """Return whether a file that is no .npz begins as recordings of 3D joints do.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     with reading(path, "a recording"), path.open("rb") as stream:
         start = stream.read(_SNIFFED).decode("utf-8-sig", "replace")
     suffix = path.suffix.lower()
@@ -289,6 +307,7 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
         raise type(error)(f"{where}: {error}") from error
     tensor = tensor @ rotation.mT
     check_upright(where, tensor, raw.names)
+    notes += _notes_on_heading(tensor, raw.names)
     skeleton = identify_skeleton(raw.names)
     weights = None
     if raw.weights is not None:
@@ -298,6 +317,14 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
         "" if skeleton is None else skeleton.name, rotation, tuple(notes), raw.companion,
         raw.first_frame,
     )  # fmt: skip
+
+
+def _notes_on_heading(joints: Tensor, names: Sequence[str]) -> list[str]:
+    """Return a note if the person's back is to the camera, as that of mirrored joints is."""
+    angle = heading(joints, names)
+    if angle is None or abs(angle) < _BACK:
+        return []
+    return [BACK_TO_CAMERA]
 
 
 def _check_shapes(raw: RawRecording) -> None:

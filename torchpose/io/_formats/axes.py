@@ -37,7 +37,8 @@ def default_axes(where: str, names: Sequence[str]) -> str:
     if skeleton is None:
         raise FileFormatError(
             f"{where}: these {len(names)} joints are no known set, so the axes cannot be told; "
-            f"state them: axes = {', '.join(AXES)} (key `axes` in the .npz, or --axes)"
+            f"state them: axes = {', '.join(AXES)} (key `axes` in the .npz, `# axes = ...` above the "
+            "header of a table, or --axes of torchpose fit)"
         )
     return skeleton.axes
 
