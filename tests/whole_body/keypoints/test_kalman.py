@@ -1,5 +1,6 @@
 """The Kalman filter over bodies against dense algebra, simulated bodies and bad keypoints."""
 
+import copy
 import math
 
 import numpy as np
@@ -312,6 +313,22 @@ def test_a_camera_that_sees_something_else_is_named(four):
     notes = track(four._replace(keypoints=keypoints)).notes
     assert any("camera c3" in note for note in notes)
     assert not any("camera c0" in note for note in notes)
+
+
+def test_joints_that_no_camera_ever_sees_are_named():
+    given = scene(2, 4)
+    given.confidence[:, :, [J("left_knee"), J("left_ankle")]] = 0.0
+    given.confidence[:, 0, J("right_knee")] = 0.0
+    (note,) = track(given).notes
+    assert note.startswith("no camera has a keypoint of left_knee, left_ankle in any frame")
+
+
+def test_a_person_of_no_persons_size_is_said():
+    given = scene(2, 4, noise=0.0)
+    small = copy.deepcopy(given.rig)
+    small.translation *= 0.5
+    assert any("a person of 0.8" in note for note in track(given._replace(rig=small)).notes)
+    assert track(given).notes == ()
 
 
 # --- forms ------------------------------------------------------------------------------------------

@@ -133,7 +133,10 @@ def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) 
     """Return the names of the keypoints."""
     sizes = {len(person) for person in everybody}
     if not sizes:
-        raise InputError(f"{folder}: nobody was found in any of {n_frames} frames")
+        raise InputError(
+            f"{folder}: nobody was found in any of {n_frames} frames; look at what the detector wrote, and "
+            "of several cameras leave this one out"
+        )
     if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
         raise FileFormatError(
             f"{folder}: expected {_KNOWN} for everybody, got {', '.join(map(str, sorted(sizes)))}"

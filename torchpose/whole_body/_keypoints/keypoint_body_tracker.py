@@ -51,6 +51,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_of,
     notes_on_a_rolled_camera,
     notes_on_left_out_cameras,
+    notes_on_size,
     notes_on_still_cameras,
     notes_on_turned_cameras,
 )
@@ -431,6 +432,10 @@ class KeypointBodyTracker(nn.Module):
         bones = body.bones(poses.point)
         rigid = _rigid_body(bones, ~poses.coasting)
         state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
+        notes: tuple[str, ...] = ()
+        if summed_up:
+            notes = self._notes(poses, frame, cameras, refined, first_frame)
+            notes += notes_on_size(rigid.height, len(self.rig), self.sized)
         return BodyTrack(
             rigid,
             state,
@@ -442,7 +447,7 @@ class KeypointBodyTracker(nn.Module):
             poses.coasting,
             poses.started & (poses.started.cumsum(0) > 1),
             self.fps,
-            notes=self._notes(poses, frame, cameras, refined, first_frame) if summed_up else (),
+            notes=notes,
             first_frame=first_frame,
             details={
                 "inlier": poses.inlier,

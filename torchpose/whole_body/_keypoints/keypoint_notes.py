@@ -17,6 +17,7 @@ _GAP = 30  # frames without keypoints that are worth a word
 _LEAST_TURN = (
     0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
 )
+_HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
 _LEANS = 8.0  # degrees by which trunk and legs lean in most images of a camera that may be rolled
 
 
@@ -61,7 +62,7 @@ def notes_of(
             notes.append(
                 f"{100 * astray:.0f} % of the keypoints of camera {name} do not agree with the body; check "
                 "its calibration, whether that is of images of the keypoints' size, its delay against the "
-                "others, and whether its video is mirrored"
+                "others, and whether its video is mirrored or its keypoints are another person's"
             )
         swapped = float((exchanged[:, c] > 0.5).all(-1)[there[:, c].any(-1)].double().mean())
         if swapped > _MIRRORED:
@@ -74,6 +75,7 @@ def notes_of(
             "one camera does not tell how large a person is: size and distance are those of the persons "
             "of the prior; give height, body, or camera_height with up, if they are known"
         )
+    notes += _notes_on_joints_without_keypoints(there)
     guessed = int((alone >= 0).sum())
     if guessed and not sized:
         seen_by = ", ".join(cameras[c] for c in alone[alone >= 0].unique().tolist())
@@ -88,6 +90,32 @@ def notes_of(
         if last - first + 1 >= _GAP
     ]
     return tuple(notes)
+
+
+def _notes_on_joints_without_keypoints(there: Bool[Tensor, "T C J"]) -> list[str]:
+    never = ~there.flatten(0, 1).any(0)
+    if not bool(never.any()):
+        return []
+    joints = ", ".join(name for name, flag in zip(BODY_15.names, never, strict=True) if flag)
+    return [
+        f"no camera has a keypoint of {joints} in any frame: they are guessed from how the people of the "
+        "prior stand and move, and may be off by much more than their standard deviations if the person "
+        "sits or lies"
+    ]
+
+
+def notes_on_size(height: float, n_cameras: int, sized: bool) -> tuple[str, ...]:
+    """Return a note if several cameras, which tell the size of a person, tell that of hardly anybody.
+
+    Args:
+        height: of the estimated bones, metres. n_cameras: how many there are. sized: whether it was given.
+    """
+    if sized or n_cameras == 1 or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
+        return ()
+    return (
+        f"the bones are those of a person of {height:.2f} m; if nobody of that size is there, the cameras "
+        "are not in metres, or the keypoints are of images of another size than the calibrated ones",
+    )
 
 
 def notes_on_still_cameras(
