@@ -265,3 +265,20 @@ def test_a_step_is_a_bounded_number_of_operations(few):
                 for t in range(12, 18):  # the lengths of bones are learnt in one of six
                     state, _ = tracker.step(state, keypoints[:, t], confidence[:, t])
         assert counter.count / 6 < most
+
+
+def test_what_is_no_tensor_or_not_of_one_frame_is_named(prior, few):
+    tracker = UpperBodyTracker(prior, camera=demo_camera(), method="mkf-fixed")
+    state, frame = tracker.init(len(few), names=NAMES), few[:, 0]
+    mask = torch.ones(len(few), len(NAMES), dtype=torch.bool)
+    for given, said in (
+        ({"keypoints": frame.tolist()}, "keypoints must be a tensor, got list"),
+        ({"confidence": 0.5}, "confidence must be a tensor, got float"),
+        ({"mask": mask.numpy()}, "mask must be a tensor, got ndarray"),
+    ):
+        with pytest.raises(InputError, match=said):
+            tracker.step(state, **{"keypoints": frame, **given})
+    with pytest.raises(InputError, match="mask must be a tensor, got ndarray"):
+        tracker(few, mask=mask[:, None].expand(few.shape[:3]).numpy(), names=NAMES)
+    with pytest.raises(ShapeError, match=r"confidence must have shape \[3, 4\], got \[4\]"):
+        tracker.step(state, frame, confidence=torch.ones(4))

@@ -185,6 +185,21 @@ def test_what_does_not_go_together_is_refused(method, options, said):
         BodyTracker(rig()).init()
 
 
+def test_keypoints_are_given_by_name_and_as_tensors():
+    frame = torch.full((2, 15, 2), 50.0)
+    kalman, particles = BodyTracker(rig(), "kalman"), BodyTracker(rig(), "sir", n_particles=20)
+    with pytest.raises(InputError, match=r"keypoints \(by name\) and no silhouettes"):
+        kalman.step(kalman.init(), frame)
+    state = particles.init(initial_state=torch.zeros(36, dtype=torch.float64))
+    for given, name in (
+        ({"keypoints": frame.tolist()}, "keypoints"),
+        ({"keypoints": frame, "confidence": frame[..., 0].numpy()}, "confidence"),
+        ({"silhouettes": [[True]]}, "silhouettes"),
+    ):
+        with pytest.raises(InputError, match=f"{name} must be a tensor, got"):
+            particles.step(state, **given)
+
+
 def test_a_direction_that_does_nothing_is_refused(scene):
     states, silhouettes = scene
     facing = torch.tensor([0.0, 0.0, 1.0])

@@ -85,6 +85,15 @@ def check_floating(name: str, tensor: Any) -> None:
         )
 
 
+def check_tensors(**values: object) -> None:
+    """Raise `InputError` for arrays and lists in place of tensors, by their names; None may pass."""
+    for name, value in values.items():
+        if value is not None and not isinstance(value, Tensor):
+            raise InputError(
+                f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
+            )
+
+
 def check_real(name: str, values: Any) -> None:
     """Raise `InputError` for complex numbers, whose imaginary parts a conversion would drop."""
     dtype = getattr(values, "dtype", None)

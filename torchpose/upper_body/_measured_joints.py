@@ -8,7 +8,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_covariance, check_finite, check_floating, check_shape
+from torchpose._core.checks import (
+    check_covariance,
+    check_finite,
+    check_floating,
+    check_shape,
+    check_tensors,
+)
 from torchpose._core.module_state import derived, index_tensor
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
@@ -164,6 +170,7 @@ def measured_keypoints(
     """
     check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
     measured = torch.isfinite(keypoints).all(-1)
+    check_tensors(mask=mask)
     if mask is not None:
         check_shape("mask", mask, list(measured.shape))
         measured = measured & mask.to(measured.device, torch.bool)

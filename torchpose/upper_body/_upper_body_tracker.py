@@ -12,6 +12,7 @@ from torchpose._core.checks import (
     check_count,
     check_floating,
     check_shape,
+    check_tensors,
     refuse_export,
 )
 from torchpose._core.module_state import (
@@ -365,7 +366,18 @@ class UpperBodyTracker(WideModule):
             ShapeError, InputError: wrong shapes, infinite values, or a state of another method.
         """
         check_stream(state)
-        check_shape("keypoints", keypoints, [len(state.unseen), state.n_keypoints, 2])
+        check_tensors(
+            keypoints=keypoints,
+            confidence=confidence,
+            mask=mask,
+            covariance=covariance,
+            absent=absent,
+        )
+        sizes = [len(state.unseen), state.n_keypoints]
+        check_shape("keypoints", keypoints, [*sizes, 2])
+        for name, value in (("confidence", confidence), ("mask", mask)):
+            if value is not None:
+                check_shape(name, value, sizes)
         given = (None if x is None else x[:, None] for x in (confidence, mask, covariance, absent))
         state, track = self.advance(state, keypoints[:, None], *given)
         return state, live_pose(track, state.unseen / (self.fps or 30.0))

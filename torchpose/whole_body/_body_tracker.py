@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_rate, check_shape
+from torchpose._core.checks import check_rate, check_shape, check_tensors
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import as_one_run, in_own_precision
@@ -319,15 +319,8 @@ class BodyTracker(nn.Module):
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
-            if silhouettes is not None:
-                given = "silhouettes" if keypoints is None else "both"
-                raise InputError(
-                    f"method {self.method} takes keypoints and no silhouettes, got {given}; other methods "
-                    "take either or both"
-                )
-            if keypoints is None:
-                raise InputError(f"method {self.method} takes keypoints, got none")
-            _check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
+            keypoints = self._keypoints_alone(silhouettes, keypoints)
+            check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
             _refuse_given(
                 self.method, initial_state=initial_state, generator=generator, lengths=lengths,
                 facing=facing, n_frames=n_frames,
@@ -486,11 +479,11 @@ class BodyTracker(nn.Module):
             self._check_kind("none", "none", persons)
             given = given_keypoints(keypoints, confidence, names, covariance)
             given = None if given is None else given.alone()
+            check_tensors(silhouettes=silhouettes)
             shown = None if silhouettes is None else [silhouettes]
             return self._tracked(state, self._by_particles.observed(shown, given)[0])
-        if keypoints is None:
-            raise InputError(f"method {self.method} takes keypoints, got none")
-        _check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
+        keypoints = self._keypoints_alone(silhouettes, keypoints)
+        check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         if (isinstance(state.filter, LivePeople) != (persons is not None)) and state.filter:
@@ -533,6 +526,20 @@ class BodyTracker(nn.Module):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
         return self._tracked(state, self._by_particles.observed(silhouettes, given)[0])
+
+    def _keypoints_alone(
+        self, silhouettes: Tensor | Iterable[Tensor] | None, keypoints: Tensor | None
+    ) -> Tensor:
+        """Return the keypoints, which are all that the Kalman filter takes."""
+        if silhouettes is not None:
+            given = "silhouettes" if keypoints is None else "both"
+            raise InputError(
+                f"method {self.method} takes keypoints (by name) and no silhouettes, got {given}; other "
+                "methods take either or both"
+            )
+        if keypoints is None:
+            raise InputError(f"method {self.method} takes keypoints, got none")
+        return keypoints
 
     def _check_kind(self, smoothing: str, refine: str, persons: str | int | None) -> None:
         """Refuse what the Kalman filter alone does."""
@@ -585,15 +592,6 @@ def _refuse(unused: Sequence[str], where: str) -> None:
     """Raise `InputError` for arguments that the method does not use."""
     if unused:
         raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
-
-
-def _check_tensors(**values: object) -> None:
-    """Raise `InputError` for arrays and lists in place of tensors."""
-    for name, value in values.items():
-        if value is not None and not isinstance(value, Tensor):
-            raise InputError(
-                f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
-            )
 
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:

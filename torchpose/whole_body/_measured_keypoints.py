@@ -7,7 +7,7 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose.body._fitting import fit_state
 from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
@@ -42,7 +42,12 @@ def given_keypoints(
     names: Sequence[str] | None,
     covariance: Tensor | None,
 ) -> GivenKeypoints | None:
-    """Return keypoints with what belongs to them, None if there are none."""
+    """Return keypoints with what belongs to them, None if there are none.
+
+    Raises:
+        InputError: arrays or lists in place of tensors.
+    """
+    check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
     if keypoints is None:
         return None
     return GivenKeypoints(keypoints, confidence, names, covariance)
