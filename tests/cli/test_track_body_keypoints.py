@@ -240,6 +240,16 @@ def test_the_body_is_drawn_into_videos(track, scene, tmp_path):
     for name in ("overlay_front.mp4", "overlay_behind.mp4", "overlay.png", "skeleton.png"):
         assert (tmp_path / name).stat().st_size > 1000
     assert "frame rate" not in done.out  # that of the other inputs
+    assert "video ends" not in done.out
+
+
+def test_a_video_that_ends_before_the_keypoints_is_said(track, tmp_path):
+    with VideoWriter(tmp_path / "short.mp4", FPS, (WIDTH, HEIGHT)) as writer:
+        for _ in range(3):
+            writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    videos = ("--camera-names", "[front]", "--videos", tmp_path / "short.mp4", "--height", "1.75")
+    done = track(tmp_path / "out", "front.npz", *videos, "--pictures", "false")
+    assert done.code == 0 and "a video ends after 3 frames" in done.out
 
 
 def test_a_detector_finds_the_keypoints_in_videos(track, scene, tmp_path, monkeypatch):

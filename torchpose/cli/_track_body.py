@@ -28,6 +28,8 @@ from torchpose.cli._track_body_output import (
 from torchpose.errors import CameraError, InputError, NobodySeenError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.whole_body._body_track import BodyTrack
     from torchpose.whole_body._body_tracker import BodyTracker
@@ -227,9 +229,9 @@ def run(
                 )
                 return 1
             written = results.commit(write_people(job, results.stage, [poses]))
-            shown = []
+            shown: list[Path] = []
             if overlay or job.pictures:
-                shown = draw(recordings, [poses], results.stage, overlay, job.pictures)
+                shown, _ = draw(recordings, [poses], results.stage, overlay, job.pictures)
         facts = _facts(given, body_tracker, recordings, poses, seconds)
         shown += write_page(recordings.views[0].source, [poses], facts, results.stage)
         written += results.commit(shown)

@@ -119,16 +119,18 @@ def track_keypoints(
         if not people:
             print(f"torchpose: {_nobody(keypoints)}, so there are no poses", file=sys.stderr)
             return 1
-        stage, drawn = results.stage, []
+        stage = results.stage
+        drawn: list[Path] = []
+        short: tuple[str, ...] = ()
         keypoints, cameras_file = _refined(keypoints, settings, people[0], stage)
         written = results.commit([*write_people(job, stage, people), *cameras_file])
         if films is not None and (overlay or job.pictures):
-            drawn = draw(films.showing(keypoints), people, stage, overlay, job.pictures)
+            drawn, short = draw(films.showing(keypoints), people, stage, overlay, job.pictures)
         if job.pictures:
             drawn += _write_skeletons(stage, people, cameras[0])
         facts = _facts(keypoints, settings, people, seconds)
         written += results.commit([*drawn, *write_page(cameras[0], people, facts, stage)])
-    return summary(people, facts, written, results.notes)
+    return summary(people, facts, written, [*short, *results.notes])
 
 
 def _nobody(keypoints: BodyKeypoints) -> str:

@@ -159,8 +159,12 @@ def _span(people: "Sequence[BodyTrack]") -> tuple[int, int]:
 
 def draw(
     films: DrawnVideos, people: "Sequence[BodyTrack]", out: Path, videos: bool, picture: bool
-) -> list[Path]:
-    """Draw all bodies into the frames of every camera: videos, and some frames as one picture."""
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Draw all bodies into the frames of every camera: videos, and some frames as one picture.
+
+    Returns:
+        The files, and a note if a video ends before the poses do.
+    """
     from contextlib import ExitStack
 
     from torchpose.video._writer import VideoWriter
@@ -169,6 +173,7 @@ def draw(
     first, end = _span(people)
     chosen = {round(i * (end - first - 1) / 5) + first for i in range(6)}
     strip: list[list[Any]] = []
+    count = 0
     with ExitStack() as stack:
         writers = [
             stack.enter_context(VideoWriter(file, films.fps, size))
@@ -177,6 +182,7 @@ def draw(
         for t, images in enumerate(films.images()):
             if t >= end:
                 break
+            count = t + 1
             if t < first:
                 continue
             if not videos and t not in chosen:
@@ -188,7 +194,11 @@ def draw(
                 strip.append(drawn)
     if picture and strip:
         files.append(_write_strip(out / "overlay.png", strip))
-    return files
+    if count == end:
+        return files, ()
+    return files, (
+        f"a video ends after {count} frames, so overlays do not show the poses after that",
+    )
 
 
 def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
