@@ -305,7 +305,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     """
     from torchpose._core.reading import read_text, reading  # io imports this module
 
-    expected = "a TOML camera file"
+    expected = "a TOML camera file (torchpose.camera.save_cameras writes one)"
     text = read_text(path, expected)
     with reading(path, expected):
         content = tomllib.loads(text)
