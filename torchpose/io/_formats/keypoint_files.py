@@ -19,6 +19,7 @@ from torchpose._core.reading import (
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
 
+_SHOWN = 3  # columns that a message lists
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 
 
@@ -86,11 +87,17 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     wanted = {"frame"} | {f"{n}_{axis}" for n in names for axis in ("x", "y", "confidence")}
     strange = [h for h in header if h not in wanted]
     absent = [f"{n}_y" for n in names if f"{n}_y" not in column]
-    if not names or strange or absent or len(column) != len(header):
+    if names and strange:
+        more = f" and {len(strange) - _SHOWN} more" if len(strange) > _SHOWN else ""
+        raise FileFormatError(
+            f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],...; delete or rename "
+            f"{', '.join(strange[:_SHOWN])}{more} (a visibility or score is NAME_confidence; no time is "
+            "read: write # fps = 30 above the header)"
+        )
+    if not names or absent or len(column) != len(header):
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],... each once, got "
-            f"{', '.join(strange + absent) or ','.join(header)}"
-            + (" (absent)" if absent and not strange else "")
+            f"{', '.join(absent) or ','.join(header)}" + " (absent)" * bool(absent)
         )
     table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
     table = table.reshape(-1, len(header))
@@ -110,7 +117,9 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
 def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
     scored = [h.lower() for h in header[4:]] == ["confidence"]
     if len(header) != 4 + scored:
-        raise FileFormatError(f"{path}: expected columns frame,name,x,y[,confidence]")
+        raise FileFormatError(
+            f"{path}: expected columns frame,name,x,y[,confidence], got {','.join(header)}"
+        )
     names = list(dict.fromkeys(cells[1] for _, cells in rows))
     table = np.array([[_cell(path, number, c) for c in (cells[0], *cells[2:])]
                       for number, cells in rows]).reshape(-1, 3 + scored)  # fmt: skip
