@@ -323,6 +323,16 @@ def test_joints_that_no_camera_ever_sees_are_named():
     assert note.startswith("no camera has a keypoint of left_knee, left_ankle in any frame")
 
 
+def test_an_axis_that_points_down_in_all_images_is_said():
+    given = scene(2, 4)
+    assert track(given, up="y").notes == ()
+    half_turn = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    over = copy.deepcopy(given.rig)
+    over.rotation *= half_turn
+    (note, *_) = track(given._replace(rig=over), up="y").notes
+    assert note.startswith("the axis that was given as up points down in all images")
+
+
 def test_a_person_of_no_persons_size_is_said():
     given = scene(2, 4, noise=0.0)
     small = copy.deepcopy(given.rig)

@@ -18,6 +18,7 @@ _LEAST_TURN = (
     0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
 )
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
+_DOWN = 0.5  # of a unit vector, along the columns of an image
 _LEANS = 8.0  # degrees by which trunk and legs lean in most images of a camera that may be rolled
 
 
@@ -200,6 +201,23 @@ def notes_on_a_rolled_camera(
         f"the person leans by {leans:.0f} degrees or more in most images of camera {name}, which is taken "
         "to be level since no up is given; if the camera is rolled, or its video turned, give up (--up), the "
         "axis of the world that points up, or turn the images",
+    )
+
+
+def notes_on_upside_down_cameras(
+    up: str | None, rotation: Float[Tensor, "C 3 3"]
+) -> tuple[str, ...]:
+    """Return a note if the axis that is said to point up points down in the images of all cameras.
+
+    Args:
+        up: "y" or "z", None if it is not known. rotation: from world to camera axes.
+    """
+    if up is None or not bool((rotation[:, 1, "xyz".index(up)] > _DOWN).all()):
+        return ()
+    return (
+        "the axis that was given as up points down in all images: another axis points up, or the cameras' "
+        "rotations are not those of a calibration (a camera without a rotation has y down); leave up (--up) "
+        "out, or correct the rotations",
     )
 
 
