@@ -91,7 +91,7 @@ def notes_on_cameras(names: Sequence[str], doubts: CameraDoubts) -> tuple[str, .
     late = (size > _LEAST_DELAY) & (size > _SURE_DELAY * std)
     notes = [
         f"camera {names[c]} seems to have begun {_in_words(doubts.delays[c], std[c])} than {names[0]}; "
-        'refine="delays" (--refine delays) corrects that'
+        'refine="delays" (--refine delays) corrects that in recordings of one person'
         for c in late.nonzero().flatten().tolist()
     ]
     turned = (doubts.turns > _LEAST_TURN) & (doubts.turn_sigmas > _SURE_TURN)
@@ -100,7 +100,7 @@ def notes_on_cameras(names: Sequence[str], doubts: CameraDoubts) -> tuple[str, .
         notes.append(
             f"camera {names[c]} sees joints {float(doubts.turns[c]):.1f} degrees away from where the others "
             "have them, so the calibrated pose of this or of another camera is wrong; "
-            'refine="extrinsics" (--refine extrinsics) corrects that'
+            'refine="extrinsics" (--refine extrinsics) corrects that in recordings of one person'
         )
     return tuple(notes)
 
