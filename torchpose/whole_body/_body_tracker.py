@@ -319,8 +319,8 @@ class BodyTracker(nn.Module):
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
         if self.by_keypoints is not None:
-            keypoints = self._keypoints_alone(silhouettes, keypoints)
             check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
+            keypoints = self._keypoints_alone(silhouettes, keypoints)
             _refuse_given(
                 self.method, initial_state=initial_state, generator=generator, lengths=lengths,
                 facing=facing, n_frames=n_frames,
@@ -482,8 +482,8 @@ class BodyTracker(nn.Module):
             check_tensors(silhouettes=silhouettes)
             shown = None if silhouettes is None else [silhouettes]
             return self._tracked(state, self._by_particles.observed(shown, given)[0])
-        keypoints = self._keypoints_alone(silhouettes, keypoints)
         check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
+        keypoints = self._keypoints_alone(silhouettes, keypoints)
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         if (isinstance(state.filter, LivePeople) != (persons is not None)) and state.filter:
@@ -534,8 +534,8 @@ class BodyTracker(nn.Module):
         if silhouettes is not None:
             given = "silhouettes" if keypoints is None else "both"
             raise InputError(
-                f"method {self.method} takes keypoints (by name) and no silhouettes, got {given}; other "
-                "methods take either or both"
+                f"method {self.method} takes keypoints and no silhouettes, got {given}; keypoints are "
+                "given by name, and other methods take either or both"
             )
         if keypoints is None:
             raise InputError(f"method {self.method} takes keypoints, got none")
