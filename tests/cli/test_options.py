@@ -19,6 +19,7 @@ from torchpose.cli import _fit_bodies as fit_bodies
 from torchpose.cli import _info as info
 from torchpose.cli import _track as track
 from torchpose.cli import _track_body as track_body
+from torchpose.cli import _track_body_options as track_body_options
 from torchpose.cli._command import Command
 from torchpose.cli._options import REQUIRED, documented, options_of, options_of_methods
 from torchpose.io import write_keypoints
@@ -264,8 +265,8 @@ def test_every_option_of_every_method_is_an_option_or_of_python_alone():
     shown = {option.name for option in track_body.command().options}
     for name in body_methods.METHODS:
         own = set(body_methods.method_options(name)) - {"limits", "posture_body"}
-        assert own <= shown | track_body.PYTHON_ONLY
-    assert not shown & track_body.PYTHON_ONLY
+        assert own <= shown | track_body_options.PYTHON_ONLY
+    assert not shown & track_body_options.PYTHON_ONLY
 
 
 class Damped(WindowMixture):

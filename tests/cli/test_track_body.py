@@ -10,9 +10,9 @@ from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.camera._projection import intrinsics
 from torchpose.cli import main
-from torchpose.cli._body_recordings import Recordings, SilhouetteSettings
-from torchpose.cli._track_body_keypoints import Films
-from torchpose.cli._track_body_output import action_text, draw, project_joints
+from torchpose.cli._body_overlays import draw, project_joints
+from torchpose.cli._body_recordings import Recordings
+from torchpose.cli._track_body_output import action_text
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.priors import ActionBank, ManifoldInfo
@@ -174,12 +174,9 @@ def test_cameras_are_scaled_to_the_videos(recorded):
         assert same.notes == []
     with Recordings(videos, larger, 60) as scaled:
         assert len(scaled.notes) == 3 and "front is scaled from 320 x 240" in scaled.notes[0]
-    with (
-        Films(videos, larger, None) as films,
-        films.recordings(30.0, SilhouetteSettings(60, None, False)) as beside_keypoints,
-    ):
-        assert beside_keypoints.notes == scaled.notes
-        told = beside_keypoints.all_notes
+    with Recordings(videos, larger, 60, fps=30.0) as slower:
+        assert slower.notes == scaled.notes
+        told = slower.all_notes
         assert len(told) == len(set(told)) and any("to 30 frames per second" in n for n in told)
     for one, other in zip(same.views, scaled.views, strict=True):
         torch.testing.assert_close(one.camera.matrix, other.camera.matrix)

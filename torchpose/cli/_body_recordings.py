@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchpose.cli._body_keypoint_inputs import BodyKeypoints
-from torchpose.cli._track_body_output import project_joints
+from torchpose.cli._body_overlays import project_joints
 
 if TYPE_CHECKING:
     from torch import Tensor

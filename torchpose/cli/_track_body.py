@@ -2,24 +2,29 @@
 
 import sys
 import time
-from argparse import ArgumentError
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from torchpose._core.checks import check_choice, check_height, check_positive
 from torchpose._core.terminal import show_progress
+from torchpose.cli._body_overlays import draw
 from torchpose.cli._body_recordings import Recordings, SilhouetteSettings
 from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible, share_cores
-from torchpose.cli._options import Option, options_of, options_of_methods
-from torchpose.cli._track import is_video
+from torchpose.cli._options import options_of
+from torchpose.cli._track_body_options import (
+    by_particles,
+    check_values,
+    filter_options,
+    parse_names,
+    parse_persons,
+    refuse_unsuited,
+)
 from torchpose.cli._track_body_output import (
     KALMAN,
     BodyJob,
     action_text,
     body_results,
-    draw,
     gate_is_in_a_note,
     summary,
     write_page,
@@ -49,20 +54,6 @@ torchpose track-body cameras.toml cam*.mp4 --manifold walk --out result
 torchpose track-body cameras.toml cam*.mp4 --method root --conditionals walk --out result
 torchpose track-body cameras.toml cam1.mp4 --method constrained --action bend.safetensors --out result
 torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
-PYTHON_ONLY = frozenset({
-    "weights", "proposal", "process_cov", "likelihood", "limit_mode", "resampling",
-    "resample_threshold", "estimate", "leg_swap", "limb_shape", "respread_scale", "n_layers",
-    "survival_rate", "schedule", "noise_decay", "survival_per_second", "normalisation",
-    "camera_rule", "observation_sharpness", "least_std", "first_std", "weighting",
-    "velocity_rate", "max_redraws", "gate_width",
-})  # fmt: skip
-"""Options of the shipped filters that only Python has: what the papers' experiments vary."""
-_HOW_SILHOUETTES = ("background", "ignore_still", "rows", "sharpness")
-_OF_PARTICLES = ("initial_pose", "manifold", "conditionals", "action", "n_particles")
-_OF_KALMAN = ("smoothing", "refine", "persons", "motion", "camera_height")
-_OF_KEYPOINTS = (
-    *_OF_KALMAN, "videos", "silhouettes", "keypoint_std", "pixel_std", "min_confidence"
-)  # fmt: skip
 
 
 def main(arguments: list[str]) -> int:
@@ -81,7 +72,7 @@ def command() -> Command:
         _EXAMPLES,
         {
             "tracker": options_of(BodyTracker, ("cameras", "method", "fps", "up")),
-            "method_options": _method_options(),
+            "method_options": filter_options(),
         },
         spaced=("inputs", "background", "videos", "formats"),
         parse={"persons": parse_persons, "camera_names": parse_names},
@@ -97,17 +88,6 @@ def command() -> Command:
             "persons": "all|N",
         },
     )
-
-
-def _method_options() -> tuple[Option, ...]:
-    """Return the options of single filters; the sharpness is the command's own, with its usual values."""
-    from torchpose.whole_body._filter_table import METHODS, method_options
-
-    having = {
-        name: [one for one in options_of(method.filter) if one.name in method_options(name)]
-        for name, method in METHODS.items()
-    }
-    return options_of_methods(having, PYTHON_ONLY | {"sharpness"})
 
 
 def run(
@@ -196,8 +176,8 @@ def run(
     from torchpose.cli._body_keypoint_inputs import are_keypoints
 
     by_keypoints = are_keypoints(inputs, detector)
-    _check(given.values)
-    _refuse_others(given, by_keypoints)
+    check_values(given.values)
+    refuse_unsuited(given, by_keypoints)
     share_cores()
     found = _cameras(cameras, camera_names, len(inputs))
     job = BodyJob(
@@ -206,7 +186,7 @@ def run(
     )  # fmt: skip
     options = {"sharpness": sharpness, **method_options}
     options = {name: value for name, value in options.items() if value is not None}
-    if not by_keypoints or _of_particles(method):
+    if not by_keypoints or by_particles(method):
         tracker |= _models(method, tracker, options, initial_pose)
     if by_keypoints:
         return _run_on_keypoints(job, inputs, found, given.values, {**tracker, **options})
@@ -238,28 +218,6 @@ def run(
     return summary([poses], facts, written, results.notes)
 
 
-def parse_persons(value: Any) -> int | str:
-    """Return "all", or a number of persons.
-
-    Raises:
-        ArgumentError: anything else.
-    """
-    text = str(value)
-    if text == "all":
-        return text
-    if not text.isdecimal() or int(text) < 1:
-        raise ArgumentError(
-            None, f"--persons must be 'all' or a number of persons from 1 on, got {text!r}"
-        )
-    return int(text)
-
-
-def parse_names(value: Any) -> list[str]:
-    """Return names from a list, or from text with commas and perhaps brackets."""
-    words = value if isinstance(value, list) else str(value).strip("[] ").split(",")
-    return [str(word).strip().strip("'\"") for word in words]
-
-
 def _run_on_keypoints(
     job: BodyJob,
     inputs: list[str],
@@ -275,7 +233,7 @@ def _run_on_keypoints(
     if values["detector"] is not None:
         detector = DetectorSettings(values["detector"], values["min_confidence"])
     arguments = tracker
-    if not _of_particles(values["method"]):
+    if not by_particles(values["method"]):
         names = ("body", "height", "keypoint_std", "pixel_std", "motion", "camera_height")
         arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
     outlines = None
@@ -287,11 +245,6 @@ def _run_on_keypoints(
         values["initial_pose"], values["seed"], outlines,
     )  # fmt: skip
     return track_keypoints(job, inputs, cameras, settings)
-
-
-def _of_particles(method: str | None) -> bool:
-    """Return whether keypoints are tracked by a particle filter."""
-    return method not in (None, KALMAN)
 
 
 def _facts(
@@ -317,94 +270,6 @@ def _facts(
         "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
     return {name: fact for name, fact in facts.items() if fact}
-
-
-def _refuse_others(given: Given, by_keypoints: bool) -> None:
-    """Raise `InputError` for a method and options that do not go with the inputs."""
-    method = given.values["method"]
-    if not by_keypoints and method == KALMAN:
-        raise InputError(
-            f"--method {method} takes keypoints: .npz, .csv or folders of OpenPose JSON files in place of "
-            "videos, or --detector, which finds them"
-        )
-    if not by_keypoints:
-        given.refuse(_OF_KEYPOINTS, "keypoints, and the inputs are videos without --detector")
-    else:
-        _refuse_beside_keypoints(given, method)
-    kalman = by_keypoints and not _of_particles(method)
-    if not kalman and given.values["up"] is not None and not given.values["formats"]:
-        raise InputError(
-            f"--up is for {KALMAN} on keypoints and for the files of --formats; the other results "
-            "are in world axes"
-        )
-    if given.values["persons"] is not None and given.values["refine"] != "none":
-        raise InputError(
-            "--refine is for recordings of one person, and --persons is given; refine the cameras on a "
-            "recording of one, and track with its refined_cameras.toml"
-        )
-
-
-def _refuse_beside_keypoints(given: Given, method: str | None) -> None:
-    """Raise `InputError` for options of silhouettes, or of another method than keypoints are tracked by."""
-    given.refuse(
-        ("facing",),
-        "silhouettes of videos, and where keypoints are given the first pose is found in these",
-    )  # fmt: skip
-    if given.values["silhouettes"]:
-        _check_silhouettes(given.values, method)
-    else:
-        given.refuse(
-            _HOW_SILHOUETTES,
-            "silhouettes of videos, which are not computed beside keypoints without --silhouettes true",
-        )  # fmt: skip
-    if _of_particles(method):
-        given.refuse(_OF_KALMAN, f"{KALMAN}, and --method {method} is given")
-    else:
-        options = (*_OF_PARTICLES, *(option.key for option in _method_options()))
-        taken = f"particle filters, and keypoints are tracked by {KALMAN} without another --method"
-        given.refuse(options, taken)
-    if given.values["detector"] is None and given.values["min_confidence"] is not None:
-        raise InputError(
-            "--min-confidence is for --detector; confidences of files count as they are"
-        )
-
-
-def _check_silhouettes(values: dict[str, Any], method: str | None) -> None:
-    """Raise `InputError` if silhouettes cannot count beside keypoints."""
-    if not _of_particles(method):
-        raise InputError(
-            f"--silhouettes true needs a particle filter by --method; {KALMAN} takes keypoints alone"
-        )
-    if values["videos"] is None and not all(map(is_video, values["inputs"])):
-        raise InputError(
-            "--silhouettes true needs the videos of all cameras, by --videos, or as inputs of --detector"
-        )
-
-
-def _check(values: dict[str, Any]) -> None:
-    """Raise `InputError` for values out of range, and for lists that do not go with the inputs."""
-    from torchpose.whole_body._body_files import BODY_FORMATS
-
-    for key in ("sharpness", "rows", "n_particles", "fps", "keypoint_std", "pixel_std"):
-        if values[key] is not None:
-            check_positive(f"--{key.replace('_', '-')}", values[key])
-    if values["height"] is not None:
-        check_height(values["height"], "--height")
-    facing, n_inputs = values["facing"], len(values["inputs"])
-    if facing is not None and values["initial_pose"]:
-        raise InputError("--facing does nothing with --initial-pose; leave one of them out")
-    if facing is not None and len(facing) != 3:
-        raise InputError(f"--facing must be three numbers, got {facing}")
-    if values["ignore_still"] and not values["background"]:
-        raise InputError("--ignore-still true needs --background")
-    for key in ("background", "delays", "videos"):
-        given = values[key]
-        if given and len(given) != n_inputs:
-            raise InputError(
-                f"--{key} needs one entry for each of the {n_inputs} cameras, got {len(given)}"
-            )
-    for kind in values["formats"] or ():
-        check_choice("--formats", kind, BODY_FORMATS)
 
 
 def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[PinholeCamera]":

@@ -3,7 +3,7 @@
 import copy
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import islice
@@ -15,6 +15,7 @@ from torchpose.cli._body_keypoint_inputs import (
     DetectorSettings,
     read_body_keypoints,
 )
+from torchpose.cli._body_overlays import Films, draw
 from torchpose.cli._body_recordings import (
     Recordings,
     SilhouetteSettings,
@@ -27,9 +28,7 @@ from torchpose.cli._track_body_output import (
     BodyJob,
     action_text,
     body_results,
-    draw,
     gate_is_in_a_note,
-    project_joints,
     summary,
     write_page,
     write_people,
@@ -43,13 +42,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.video._source_interface import VideoSource
     from torchpose.whole_body._body_track import BodyTrack
     from torchpose.whole_body._body_tracker import BodyTracker
 
 _CAMERAS = "refined_cameras.toml"
 _FPS = 30.0  # frames per second with which options are checked before inputs are read
-_SAME_RATE = 0.01  # relative: of videos that are not resampled
 
 
 class KeypointSettings(NamedTuple):
@@ -111,8 +108,13 @@ def track_keypoints(
             everybody=settings.persons is not None,
         )  # fmt: skip
         recordings = None
-        if films is not None and settings.silhouettes is not None:
-            recordings = stack.enter_context(films.recordings(keypoints.fps, settings.silhouettes))
+        if shown is not None and settings.silhouettes is not None:
+            recordings = stack.enter_context(
+                Recordings(
+                    shown, cameras, fps=keypoints.fps, delays=settings.delays,
+                    **settings.silhouettes._asdict(),
+                )
+            )  # fmt: skip
         start = time.perf_counter()
         people = _track(keypoints, settings, recordings)
         seconds = time.perf_counter() - start
@@ -315,112 +317,3 @@ def _write_skeleton(path: "Path", poses: "BodyTrack", camera: "PinholeCamera") -
         observed=seen.observed[0], feet=feet if poses.feet is not None else None,
     )  # fmt: skip
     return save_figure(figure, path)
-
-
-class Films:
-    """The videos that bodies are drawn into; a context manager, which closes them.
-
-    Args:
-        videos: one for each camera. cameras: calibrated. delays: frames by which each began too early.
-
-    Attributes:
-        rates: frames per second of each. sizes: (width, height) of each.
-
-    Raises:
-        InputError, FileFormatError: videos that cannot be read. CameraError: of another shape.
-    """
-
-    def __init__(
-        self,
-        videos: Sequence[str],
-        cameras: "Sequence[PinholeCamera]",
-        delays: Sequence[int] | None,
-    ) -> None:
-        from torchpose.camera._choice import fit_to_size
-        from torchpose.video._source import open_video
-
-        self._videos, self._delays = videos, delays or [0] * len(videos)
-        self.names = [camera.name for camera in cameras]
-        self._sources = [open_video(path) for path in videos]
-        self.rates = [float(source.fps) for source in self._sources]
-        self.sizes = [source.size for source in self._sources]
-        self._calibrated = cameras
-        self._cameras = [
-            fit_to_size(camera, size, path)[0]
-            for camera, size, path in zip(cameras, self.sizes, videos, strict=True)
-        ]
-
-    def __enter__(self) -> "Films":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for source in self._sources:
-            source.close()
-
-    def recordings(self, fps: float, settings: SilhouetteSettings) -> Recordings:
-        """Return the same videos at a frame rate, to become silhouettes."""
-        return Recordings(
-            self._videos, self._calibrated, settings.rows, fps=fps, delays=self._delays,
-            background=settings.background, ignore_still=settings.ignore_still,
-        )  # fmt: skip
-
-    def showing(self, keypoints: BodyKeypoints) -> "Films":
-        """Return the same with keypoints to be drawn, at whose frame rate the videos are read."""
-        self.fps, self._keypoints = keypoints.fps, keypoints
-        for shown, camera in zip(self._cameras, keypoints.cameras, strict=True):
-            shown.rotation, shown.translation = camera.rotation, camera.translation
-        return self
-
-    def images(self) -> Iterator[tuple[Any, ...]]:
-        """Read the frames of all cameras."""
-        from torchpose.video._silhouettes import frames_in_step
-
-        with ExitStack() as stack:
-            sources = [stack.enter_context(self._open(i)) for i in range(len(self._videos))]
-            for frames in frames_in_step(sources, self._delays):
-                yield tuple(frame.image for frame in frames)
-
-    def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the bodies and all keypoints."""
-        there = [
-            (place, poses)
-            for place, poses in enumerate(people)
-            if 0 <= t - poses.first_frame < len(poses)
-        ]
-        drawn = list(images)
-        for order, (place, poses) in enumerate(there, 1):
-            tint = None if len(people) == 1 else place
-            drawn = [self._drawn(image, poses, t, c, tint, order == len(there))
-                     for c, image in enumerate(drawn)]  # fmt: skip
-        return drawn
-
-    def _drawn(
-        self, image: Any, poses: "BodyTrack", t: int, c: int, tint: int | None, crosses: bool
-    ) -> Any:
-        """Return the image of camera c with one body; `tint` is the place of one of several."""
-        import torch
-
-        from torchpose.video._overlay import draw_body
-
-        delays = poses.details.get("camera_delays", torch.zeros(1, len(self._cameras)))[0]
-        at = int((t - poses.first_frame - delays[c].round().long()).clamp(0, len(poses) - 1))
-        feet = None
-        if poses.feet is not None:
-            feet = project_joints(poses.feet.points3d[at], self._cameras[c])
-        return draw_body(
-            image, project_joints(poses.joints3d[at], self._cameras[c]), poses.body.skeleton,
-            keypoints=self._seen(t, c) if crosses else None,
-            label="" if tint is None else f"person {tint + 1}", tint=tint, feet=feet,
-        )  # fmt: skip
-
-    def _open(self, i: int) -> "VideoSource":
-        from torchpose.video._source import open_video
-
-        same = abs(self.rates[i] / self.fps - 1) < _SAME_RATE
-        return open_video(self._videos[i], fps=None if same else self.fps)
-
-    def _seen(self, t: int, c: int) -> "Tensor":
-        """Return the keypoints of a camera in pixels of its video, [K, 2] of all detections."""
-        measured, shown = self._keypoints.cameras[c].matrix, self._cameras[c].matrix
-        scale = shown.diagonal()[:2] / measured.diagonal()[:2]
-        return (self._keypoints.points[t, c].reshape(-1, 2) + 0.5) * scale - 0.5

@@ -1,18 +1,17 @@
-"""What `torchpose track-body` writes and prints: poses, pictures, words."""
+"""What `torchpose track-body` writes and prints: poses, the page, words."""
 
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple
 
+from torchpose.cli._body_overlays import overlay_name, span_of
 from torchpose.cli._track_output import person_suffix
 from torchpose.errors import DegenerateFilterWarning
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.io._results import ResultsFolder
     from torchpose.whole_body._body_track import BodyTrack
@@ -25,7 +24,6 @@ _OWN = (
     r"|overlay(_.+\.mp4|\.png)|report\.html"
     r"|refined_cameras\.toml"
 )
-_FOLDED = 0.01  # of a ray's length: between it and what its pixel is undistorted to
 _MOST_RUNS = 8  # of actions that are listed by their frames
 
 
@@ -46,34 +44,6 @@ class BodyJob(NamedTuple):
     pictures: bool
 
 
-@runtime_checkable
-class DrawnVideos(Protocol):
-    """Declares the videos of all cameras, and how bodies are drawn into them."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Return the names of the cameras."""
-        ...
-
-    @property
-    def sizes(self) -> Sequence[tuple[int, int]]:
-        """Return (width, height) of each video."""
-        ...
-
-    @property
-    def fps(self) -> float:
-        """Return the frames per second."""
-        ...
-
-    def images(self) -> Iterator[tuple[Any, ...]]:
-        """Read the frames of all cameras."""
-        ...
-
-    def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the bodies that are there."""
-        ...
-
-
 def body_results(
     job: BodyJob, cameras: "Sequence[PinholeCamera]", overlay: bool, pictures: Sequence[str]
 ) -> "ResultsFolder":
@@ -85,7 +55,7 @@ def body_results(
     """
     from torchpose.io._results import ResultsFolder, holds_arrays
 
-    videos = [_overlay_name(camera.name) for camera in cameras] if overlay else []
+    videos = [overlay_name(camera.name) for camera in cameras] if overlay else []
     return ResultsFolder(
         job.out,
         "track",
@@ -98,10 +68,6 @@ def body_results(
 
 def _exports(job: BodyJob) -> list[str]:
     return [f"body.{suffix}" for suffix in job.formats]
-
-
-def _overlay_name(camera: str) -> str:
-    return f"overlay_{camera}.mp4"
 
 
 def write_people(job: BodyJob, out: Path, people: "Sequence[BodyTrack]") -> list[Path]:
@@ -151,97 +117,6 @@ def _write_csv(path: Path, poses: "BodyTrack") -> None:
             stream.write(",".join(cells) + "\n")
 
 
-def _span(people: "Sequence[BodyTrack]") -> tuple[int, int]:
-    """Return the first frame with somebody, and the one after the last."""
-    first = min(poses.first_frame for poses in people)
-    return first, max(poses.first_frame + len(poses) for poses in people)
-
-
-def draw(
-    films: DrawnVideos, people: "Sequence[BodyTrack]", out: Path, videos: bool, picture: bool
-) -> tuple[list[Path], tuple[str, ...]]:
-    """Draw all bodies into the frames of every camera: videos, and some frames as one picture.
-
-    Returns:
-        The files, and a note if a video ends before the poses do.
-    """
-    from contextlib import ExitStack
-
-    from torchpose.video._writer import VideoWriter
-
-    files = [out / _overlay_name(name) for name in films.names] if videos else []
-    first, end = _span(people)
-    chosen = {round(i * (end - first - 1) / 5) + first for i in range(6)}
-    strip: list[list[Any]] = []
-    count = 0
-    with ExitStack() as stack:
-        writers = [
-            stack.enter_context(VideoWriter(file, films.fps, size))
-            for file, size in zip(files, films.sizes, strict=False)
-        ]
-        for t, images in enumerate(films.images()):
-            if t >= end:
-                break
-            count = t + 1
-            if t < first:
-                continue
-            if not videos and t not in chosen:
-                continue
-            drawn = films.drawn(people, t, images)
-            for writer, image in zip(writers, drawn, strict=False):
-                writer.write(image)
-            if t in chosen:
-                strip.append(drawn)
-    if picture and strip:
-        files.append(_write_strip(out / "overlay.png", strip))
-    if count == end:
-        return files, ()
-    return files, (
-        f"a video ends after {count} frames, so overlays do not show the poses after that",
-    )
-
-
-def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
-    """Return the pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied.
-
-    Points have none, NaN, behind the camera, and where the distortions, which were fitted to the image alone,
-    fold back into it what lies far beside it.
-    """
-    import torch
-
-    from torchpose.camera._rig import distort_rays, straighten_rays
-
-    points = joints.detach().cpu().double() @ camera.rotation_matrix.mT + camera.translation
-    straight, lens = points[:, :2] / points[:, 2:], (camera.distortions, camera.fisheye)
-    rays = distort_rays(straight, *lens)
-    size = 1 + straight.norm(dim=-1, keepdim=True)
-    off = (straighten_rays(rays, *lens) - straight).norm(dim=-1, keepdim=True) / size
-    pixels = rays @ camera.matrix[:2, :2].mT + camera.matrix[:2, 2]
-    return torch.where((points[:, 2:] > 0) & (off < _FOLDED), pixels, torch.nan)
-
-
-def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
-    """Write frames as columns and cameras as rows."""
-    import cv2
-    import numpy as np
-
-    from torchpose._core.files import atomic_path
-
-    height = 320
-
-    def small(image: Any) -> Any:
-        width = max(1, round(image.shape[1] * height / image.shape[0]))
-        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-    rows = [np.hstack([small(frame[c]) for frame in strip]) for c in range(len(strip[0]))]
-    widest = max(row.shape[1] for row in rows)
-    rows = [np.pad(row, ((0, 4), (0, widest - row.shape[1]), (0, 0))) for row in rows]
-    with atomic_path(path) as temporary:
-        coded = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))[1]
-        temporary.write_bytes(coded.tobytes())
-    return path
-
-
 @contextmanager
 def gate_is_in_a_note() -> Iterator[None]:
     """Keep quiet about frames in which the gate of an action lets nobody pass; a note numbers them."""
@@ -277,10 +152,10 @@ def write_page(
     from torchpose.body._feet import FOOT_BONES
     from torchpose.viz._report.page import write_report
 
-    overlay = out / _overlay_name(camera.name)
+    overlay = out / overlay_name(camera.name)
     bones = [(p, j) for j, p in enumerate(people[0].body.skeleton.parents) if p >= 0]
     bones += FOOT_BONES if people[0].feet is not None else ()
-    first, end = _span(people)
+    first, end = span_of(people)
     late = [f"frame 0 of this page is frame {first} of the recording"] if first else []
     page = write_report(
         out / "report.html", [poses.seen_by(camera) for poses in people],
