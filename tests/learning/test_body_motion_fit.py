@@ -10,18 +10,16 @@ import torch
 from tests.body.test_articulation import zero_point
 from tests.priors.poses import recording
 from torchpose.body import fit_body, fit_state
-from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.body._articulation import Articulation, BodyPoint, mirror_of
 from torchpose.errors import InputError
 from torchpose.learning._body_motion_fit import (
     BodyMotionRecipe,
-    MotionSequence,
     _draw_poses,
     acceleration_ratio,
     fit_body_motion,
-    mirror_of,
-    motion_sequence,
     pose_log_density,
 )
+from torchpose.learning._motion_sequences import MotionSequence, motion_sequence
 from torchpose.learning._recipes.body_motion import _set_of
 from torchpose.math._rotations import matrix_to_quaternion_vector
 

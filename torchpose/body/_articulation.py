@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from torchpose.body._kinematics import Body
 from torchpose.body._limbs import chained, level_plan
-from torchpose.body._skeleton import BODY_15, BodySkeleton
+from torchpose.body._skeleton import BODY_15, BodySkeleton, other_side
 from torchpose.math._rotations import (
     cross_matrix,
     exponential,
@@ -314,6 +314,26 @@ class Articulation(nn.Module):
             [eye, turned.movedim(-3, -1), none, by_scale, by_shift.flatten(-2)], -1
         )
         return JointJacobian(joints, jacobian)
+
+
+class Mirror(NamedTuple):
+    """Holds which column [R] of rotations the mirror image has in place of each, and its sign [R]."""
+
+    columns: Tensor
+    sign: Tensor
+
+
+def mirror_of(articulation: Articulation) -> Mirror:
+    """Return what mirroring left and right does to the angles of an articulation.
+
+    In a mirror across x, rotation vectors (x, y, z) become (x, -y, -z), of the part on the other side.
+    """
+    parts = articulation.skeleton.parts
+    places = list(zip(articulation.axis_part.tolist(), articulation.axis.tolist(), strict=True))
+    other = [(parts.index(other_side(parts[p])), a) for p, a in places]
+    sign = [1.0 if a == 0 else -1.0 for _, a in places]
+    columns = torch.tensor([places.index(place) for place in other])
+    return Mirror(columns, torch.tensor(sign, dtype=torch.float64))
 
 
 def _rotation_vectors(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:

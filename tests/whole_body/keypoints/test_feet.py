@@ -9,10 +9,9 @@ from torch.testing import assert_close
 from tests.whole_body.keypoints.scenes import FPS, NAMES, ring, scene
 from torchpose import BodyTracker
 from torchpose.body import BODY_15
-from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.body._articulation import Articulation, BodyPoint, mirror_of
 from torchpose.body._feet import ANKLES, FEET, foot_points, foot_shape
 from torchpose.errors import FileFormatError
-from torchpose.learning._body_motion_fit import mirror_of
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.metrics import coverage
 from torchpose.priors._foot_prior import shipped_foot_prior

@@ -17,12 +17,11 @@ from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._body_motion_fit import (
     BodyMotionRecipe,
-    MotionSequence,
     acceleration_ratio,
     fit_body_motion,
-    motion_sequence,
     pose_log_density,
 )
+from torchpose.learning._motion_sequences import MotionSequence, motion_sequence
 from torchpose.learning._recipes.choosing import (
     body_of_each,
     choose_recordings,
