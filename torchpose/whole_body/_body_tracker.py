@@ -27,6 +27,16 @@ from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._body_arguments import (
+    check_facing,
+    check_filters_one,
+    check_not_refined,
+    check_tensors,
+    given_of,
+    keypoints_alone,
+    refuse,
+    whole_length,
+)
 from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
 from torchpose.whole_body._filter_table import (
     LEARNT,
@@ -168,18 +178,16 @@ class BodyTracker(nn.Module):
     ) -> None:
         super().__init__()
         check_rate("fps", fps)
-        given = {"manifold": manifold, "conditionals": conditionals, "action": action}
-        given = {kind: value for kind, value in given.items() if value is not None}
+        given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
         rig = as_rig(cameras)
         check_room(rig)
-        self.by_keypoints: KeypointBodyTracker | None = None
+        self.fps = float(fps)
         self.notes: tuple[str, ...] = ()
+        self.by_keypoints: KeypointBodyTracker | None = None
         if method == KEYPOINT_METHOD:
-            unused = [*given, *options]
-            unused += ["process_cov"] * (process_cov is not None)
-            unused += ["initial_cov"] * (initial_cov is not None)
-            _refuse(unused, f"for method {method}")
-            self.method, self.fps = method, float(fps)
+            noise = {"process_cov": process_cov, "initial_cov": initial_cov}
+            refuse([*given, *options, *given_of(noise)], f"for method {method}")
+            self.method = method
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.cameras, self.n_particles = rig, 0
             self.by_keypoints = KeypointBodyTracker(
@@ -189,36 +197,26 @@ class BodyTracker(nn.Module):
             )  # fmt: skip
             return
         of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
-        unused = [name for name, value in of_kalman.items() if value is not None]
-        _refuse(unused, f"without method={KEYPOINT_METHOD!r}")
-        height = _HEIGHT if height is None else height
+        refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
         self.method = choose_method(method, given)
-        models = {kind: _model(kind, value, fps) for kind, value in given.items()}
-        needs = METHODS[self.method].needs
-        person = rebased(_person(body, height), "parent", None)
-        upright, tracked, learnt = person, person, None
-        if "manifold" in models:
-            upright = LEARNT["manifold"].body(person, models["manifold"][0])
-        if needs is not None:
-            learnt = models[needs][0]
-            tracked = upright if needs == "manifold" else LEARNT[needs].body(person, learnt)
-        noise = {} if process_cov is None else {"process_cov": process_cov}
+        found = {kind: _model(kind, value, fps) for kind, value in given.items()}
+        models = {kind: model for kind, (model, _) in found.items()}
+        person = rebased(_person(body, _HEIGHT if height is None else height), "parent", None)
+        upright, tracked, learnt = _bodies(self.method, person, models)
+        noise = given_of({"process_cov": process_cov})
         self.filter = make_filter(
             self.method, tracked, learnt, fps, n_particles, {**options, **noise}
         )
-        self.cameras, self.fps, self.n_particles = rig, float(fps), n_particles
-        self.notes = tuple(filter(None, (note for _, note in models.values())))
+        self.cameras, self.n_particles = rig, n_particles
+        self.notes = tuple(note for _, note in found.values() if note)
         # of the filter where these are the same, so that its tensors are in the state once
         self._upright = None if upright is tracked else upright
-        std = (
-            None
-            if initial_cov is None
-            else std_of_covariance("initial_cov", initial_cov, tracked.dim)
-        )
+        std = None
+        if initial_cov is not None:
+            std = std_of_covariance("initial_cov", initial_cov, tracked.dim)
         self.register_buffer("_initial_std", std, persistent=std is not None)
-        self._search = (
-            models["manifold"][0] if "manifold" in models and needs != "manifold" else None
-        )
+        own = METHODS[self.method].needs == "manifold"  # then the filter holds it
+        self._search = None if own else models.get("manifold")
         self._by_particles = ParticleFollower(
             self.method, self.filter, self.cameras, self.fps, self._upright, self._search,
             (keypoint_std, pixel_std),
@@ -320,31 +318,26 @@ class BodyTracker(nn.Module):
         """
         if self.by_keypoints is not None:
             check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
-            keypoints = self._keypoints_alone(silhouettes, keypoints)
-            _refuse_given(
-                self.method, initial_state=initial_state, generator=generator, lengths=lengths,
-                facing=facing, n_frames=n_frames,
-            )  # fmt: skip
-            if persons is not None and refine != "none":
-                raise InputError(
-                    f"refine={refine!r} is for recordings of one person, and persons is given; refine "
-                    "cameras on a recording of one, and take its details"
-                )
-            if persons is not None:
-                return PeopleBodyTracker(self.by_keypoints, persons).forward(
-                    keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
-                    progress=progress,
-                )  # fmt: skip
-            return self.by_keypoints(
-                keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
-                refine=refine, progress=progress,
-            )  # fmt: skip
-        self._check_kind(smoothing, refine, persons)
-        _check_facing(facing, initial_state, keypoints)
+            keypoints = keypoints_alone(self.method, silhouettes, keypoints)
+            others = {
+                "initial_state": initial_state, "generator": generator, "lengths": lengths,
+                "facing": facing, "n_frames": n_frames,
+            }  # fmt: skip
+            refuse(given_of(others), f"for method {self.method}")
+            options: dict[str, Any] = {
+                "covariance": covariance, "smoothing": smoothing, "progress": progress
+            }  # fmt: skip
+            if persons is None:
+                return self.by_keypoints(keypoints, confidence, names, refine=refine, **options)
+            check_not_refined(refine)
+            people = PeopleBodyTracker(self.by_keypoints, persons)
+            return people.forward(keypoints, confidence, names, **options)
+        check_filters_one(self.method, smoothing, refine, persons)
+        check_facing(facing, initial_state, keypoints)
         source, measured = self._by_particles.observed(
             silhouettes, given_keypoints(keypoints, confidence, names, covariance)
         )
-        frames = source if lengths is None else islice(source, _whole(lengths))
+        frames = source if lengths is None else islice(source, whole_length(lengths))
         begun, first = self._by_particles.first_seen(frames, measured)
         looked_at = 1 if initial_state is not None else self._by_particles.looked_at
         begin = [first, *islice(frames, looked_at - 1)]
@@ -397,12 +390,13 @@ class BodyTracker(nn.Module):
             use. ShapeError, CameraError: as `forward`.
         """
         if self.by_keypoints is not None:
-            _refuse_given(
-                self.method, silhouettes=silhouettes, initial_state=initial_state,
-                generator=generator, facing=facing,
-            )  # fmt: skip
+            others = {
+                "silhouettes": silhouettes, "initial_state": initial_state, "generator": generator,
+                "facing": facing,
+            }  # fmt: skip
+            refuse(given_of(others), f"for method {self.method}")
             return BodyStream(None, 0, None, _names(names))
-        _check_facing(facing, initial_state, keypoints)
+        check_facing(facing, initial_state, keypoints)
         if initial_state is None:
             if silhouettes is None and keypoints is None:
                 raise InputError(
@@ -476,26 +470,26 @@ class BodyTracker(nn.Module):
         """
         names = _stream_names(state, names)
         if self.by_keypoints is None:
-            self._check_kind("none", "none", persons)
+            check_filters_one(self.method, "none", "none", persons)
             given = given_keypoints(keypoints, confidence, names, covariance)
             given = None if given is None else given.alone()
             check_tensors(silhouettes=silhouettes)
             shown = None if silhouettes is None else [silhouettes]
             return self._tracked(state, self._by_particles.observed(shown, given)[0])
         check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
-        keypoints = self._keypoints_alone(silhouettes, keypoints)
+        keypoints = keypoints_alone(self.method, silhouettes, keypoints)
         if isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         if (isinstance(state.filter, LivePeople) != (persons is not None)) and state.filter:
             raise InputError("persons must be given in all steps of a stream or in none")
-        if persons is not None:
-            return self._step_people(state, keypoints, confidence, names, covariance, persons)
-        assert not isinstance(state.filter, LivePeople)
-        after, pose = self.by_keypoints.step(
+        single = self.by_keypoints
+        tracker: Any = single if persons is None else PeopleBodyTracker(single, persons)
+        after, found = tracker.step(
             state.filter, keypoints, confidence, names, covariance=covariance
         )
-        pose.first_frame = state.frame
-        return state._replace(filter=after, frame=state.frame + 1), pose
+        for pose in [found] if persons is None else found:
+            pose.first_frame = state.frame
+        return state._replace(filter=after, frame=state.frame + 1), found
 
     @torch.no_grad()
     @as_one_run
@@ -527,33 +521,6 @@ class BodyTracker(nn.Module):
         given = given_keypoints(keypoints, confidence, names, covariance)
         return self._tracked(state, self._by_particles.observed(silhouettes, given)[0])
 
-    def _keypoints_alone(
-        self, silhouettes: Tensor | Iterable[Tensor] | None, keypoints: Tensor | None
-    ) -> Tensor:
-        """Return the keypoints, which are all that the Kalman filter takes."""
-        if silhouettes is not None:
-            given = "silhouettes" if keypoints is None else "both"
-            raise InputError(
-                f"method {self.method} takes keypoints and no silhouettes, got {given}; keypoints are "
-                "given by name, and other methods take either or both"
-            )
-        if keypoints is None:
-            raise InputError(f"method {self.method} takes keypoints, got none")
-        return keypoints
-
-    def _check_kind(self, smoothing: str, refine: str, persons: str | int | None) -> None:
-        """Refuse what the Kalman filter alone does."""
-        if smoothing != "none":
-            raise InputError(
-                f"smoothing={smoothing!r} needs method={KEYPOINT_METHOD!r}; method {self.method} filters"
-            )
-        if refine != "none" or persons is not None:
-            given = "persons" if persons is not None else f"refine={refine!r}"
-            raise InputError(
-                f"{given} needs method={KEYPOINT_METHOD!r}; method {self.method} tracks one person in "
-                "cameras as they are given"
-            )
-
     def _tracked(
         self, state: BodyStream, frames: Iterable[Observed]
     ) -> tuple[BodyStream, BodyTrack]:
@@ -565,33 +532,8 @@ class BodyTracker(nn.Module):
         poses.notes = (*self.notes, *poses.notes)
         return state._replace(filter=after, frame=state.frame + len(poses)), poses
 
-    def _step_people(
-        self,
-        state: BodyStream,
-        keypoints: Tensor,
-        confidence: Tensor | None,
-        names: Sequence[str] | None,
-        covariance: Tensor | None,
-        persons: str | int,
-    ) -> tuple[BodyStream, list[BodyTrack]]:
-        """Track the persons of one more frame."""
-        assert self.by_keypoints is not None  # or there is no state without particles
-        before = state.filter if isinstance(state.filter, LivePeople) else None
-        after, poses = PeopleBodyTracker(self.by_keypoints, persons).step(
-            before, keypoints, confidence, names, covariance=covariance
-        )
-        for pose in poses:
-            pose.first_frame = state.frame
-        return state._replace(filter=after, frame=state.frame + 1), poses
-
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
-
-
-def _refuse(unused: Sequence[str], where: str) -> None:
-    """Raise `InputError` for arguments that the method does not use."""
-    if unused:
-        raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
 
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:
@@ -612,31 +554,21 @@ def _stream_names(state: BodyStream, names: Sequence[str] | None) -> Sequence[st
     return state.names if names is None else names
 
 
-def _refuse_given(method: str, **arguments: Any) -> None:
-    """Raise `InputError` for arguments that were given to a method that does not use them."""
-    _refuse([name for name, v in arguments.items() if v is not None], f"for method {method}")
-
-
-def _check_facing(facing: Any, initial_state: Any, keypoints: Any) -> None:
-    """Refuse a direction where the first pose is given, or found in keypoints, which show it."""
-    if initial_state is not None:
-        _refuse(["facing"] * (facing is not None), "beside an initial_state")
-    if keypoints is not None:
-        _refuse(["facing"] * (facing is not None), "where keypoints are given, which show it")
-
-
 def _person(body: Body | str | Path | None, height: float) -> Body:
     if isinstance(body, Body):
         return body
     return Body.of_height(BODY_15, height) if body is None else load_body(body)
 
 
-def _whole(lengths: Int[Tensor, "1"]) -> int:
-    """Return how many frames of a sequence are tracked; `check_lengths` follows when all are counted."""
-    check_shape("lengths", lengths, [1])
-    if int(lengths) < 1:
-        raise InputError(f"lengths must be integers of 1 or more, got {lengths.tolist()}")
-    return int(lengths)
+def _bodies(method: str, person: Body, models: dict[str, Any]) -> tuple[Body, Body, Any]:
+    """Return the body with which the first pose is found, the one that is tracked, and the method's model."""
+    upright, needs = person, METHODS[method].needs
+    if "manifold" in models:
+        upright = LEARNT["manifold"].body(person, models["manifold"])
+    if needs is None:
+        return upright, person, None
+    tracked = upright if needs == "manifold" else LEARNT[needs].body(person, models[needs])
+    return upright, tracked, models[needs]
 
 
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:

@@ -262,7 +262,8 @@ def test_bad_keypoints_are_refused():
         tracker(keypoints=seen.keypoints[None])
     with pytest.raises(NobodySeenError, match="no keypoint"):
         tracker(keypoints=torch.full_like(seen.keypoints, torch.nan))
+    masks, kalman = torch.ones(2, 2, 54, 96, dtype=torch.bool), BodyTracker(seen.rig, "kalman")
     with pytest.raises(InputError, match="takes keypoints and no silhouettes"):
-        BodyTracker(seen.rig, "kalman")(
-            torch.ones(2, 2, 54, 96, dtype=torch.bool), keypoints=seen.keypoints
-        )
+        kalman(masks, keypoints=seen.keypoints)
+    with pytest.raises(InputError, match="takes keypoints and no silhouettes"):
+        kalman.step(kalman.init(), masks[0], keypoints=seen.keypoints[0])

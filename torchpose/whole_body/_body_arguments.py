@@ -1,0 +1,83 @@
+"""Check what `BodyTracker` is given: arguments that its method does not use are refused."""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from jaxtyping import Int
+from torch import Tensor
+
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
+from torchpose.whole_body._keypoints.keypoint_body_tracker import KEYPOINT_METHOD
+
+
+def given_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments that are not None."""
+    return {name: value for name, value in arguments.items() if value is not None}
+
+
+def refuse(unused: Collection[str], where: str) -> None:
+    """Raise `InputError` for arguments that the method does not use."""
+    if unused:
+        raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
+
+
+def check_tensors(**values: object) -> None:
+    """Raise `InputError` for arrays and lists in place of tensors."""
+    for name, value in given_of(values).items():
+        if not isinstance(value, Tensor):
+            raise InputError(
+                f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
+            )
+
+
+def keypoints_alone(method: str, silhouettes: Any, keypoints: Any) -> Any:
+    """Return keypoints; raise `InputError` for silhouettes, and without keypoints."""
+    if silhouettes is not None:
+        given = "silhouettes" if keypoints is None else "both"
+        raise InputError(
+            f"method {method} takes keypoints and no silhouettes, got {given}; other methods "
+            "take either or both"
+        )
+    if keypoints is None:
+        raise InputError(f"method {method} takes keypoints, got none")
+    return keypoints
+
+
+def check_not_refined(refine: str) -> None:
+    """Raise `InputError` for cameras that are to be refined by several persons."""
+    if refine != "none":
+        raise InputError(
+            f"refine={refine!r} is for recordings of one person, and persons is given; refine "
+            "cameras on a recording of one, and take its details"
+        )
+
+
+def check_filters_one(method: str, smoothing: str, refine: str, persons: str | int | None) -> None:
+    """Raise `InputError` for what the Kalman filter alone does: smooth, refine, and track several persons."""
+    if smoothing != "none":
+        raise InputError(
+            f"smoothing={smoothing!r} needs method={KEYPOINT_METHOD!r}; method {method} filters"
+        )
+    if refine != "none" or persons is not None:
+        given = "persons" if persons is not None else f"refine={refine!r}"
+        raise InputError(
+            f"{given} needs method={KEYPOINT_METHOD!r}; method {method} tracks one person in "
+            "cameras as they are given"
+        )
+
+
+def check_facing(facing: Any, initial_state: Any, keypoints: Any) -> None:
+    """Raise `InputError` for a direction where the first pose is given, or found in keypoints."""
+    if initial_state is not None:
+        refuse(["facing"] * (facing is not None), "beside an initial_state")
+    if keypoints is not None:
+        refuse(["facing"] * (facing is not None), "where keypoints are given, which show it")
+
+
+def whole_length(lengths: Int[Tensor, "1"]) -> int:
+    """Return how many frames of a sequence are tracked; `check_lengths` follows when all are counted."""
+    check_shape("lengths", lengths, [1])
+    if int(lengths) < 1:
+        raise InputError(f"lengths must be integers of 1 or more, got {lengths.tolist()}")
+    return int(lengths)
