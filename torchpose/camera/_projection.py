@@ -78,6 +78,18 @@ def backproject(
     return torch.stack([(u - skew * y) / fx, y, torch.ones_like(y)], -1) * depth
 
 
+def turn_homography(
+    rotation: Float[Tensor, "*batch 3 3"], matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return K R K^-1, the map of homogeneous pixels when a camera turns."""
+    return torch.linalg.solve_triangular(matrix, matrix @ rotation, upper=True, left=False)
+
+
+def homogeneous_pixels(uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    """Return pixels (u, v, 1)."""
+    return torch.nn.functional.pad(uv, (0, 1), value=1.0)
+
+
 def lift(
     uvl: Float[Tensor, "... J 3"],
     K: Float[Tensor, "... 3 3"],

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.camera._projection import homogeneous_pixels, turn_homography
 from torchpose.errors import CameraError
 
 LARGEST_PITCH = math.radians(60.0)
@@ -102,7 +103,7 @@ class Turn(NamedTuple):
             up: the unit vector that points up, in camera axes. matrix: K of both.
         """
         rotation = level_rotation(up.to(matrix))
-        return cls(rotation, _homography(rotation, matrix))
+        return cls(rotation, turn_homography(rotation, matrix))
 
     def back(self, matrix: Float[Tensor, "3 3"]) -> Self:
         """Return the inverse.
@@ -110,11 +111,11 @@ class Turn(NamedTuple):
         Args:
             matrix: K of both.
         """
-        return type(self)(self.rotation.mT, _homography(self.rotation.mT, matrix))
+        return type(self)(self.rotation.mT, turn_homography(self.rotation.mT, matrix))
 
     def points(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Return turned pixels; those beyond `visible` are far outside of the image."""
-        seen = _homogeneous(uv) @ self.homography.to(uv).mT
+        seen = homogeneous_pixels(uv) @ self.homography.to(uv).mT
         return seen[..., :2] / _in_front(seen[..., 2:])
 
     def covariances(
@@ -126,7 +127,7 @@ class Turn(NamedTuple):
             covariance: C, pixels squared. uv: the pixels before the turn.
         """
         homography = self.homography.to(uv)
-        seen = (_homogeneous(uv) @ homography.mT)[..., None]
+        seen = (homogeneous_pixels(uv) @ homography.mT)[..., None]
         depth = _in_front(seen[..., 2:, :])
         slopes = (homography[:2, :2] - seen[..., :2, :] / depth * homography[2, :2]) / depth
         return slopes @ covariance.to(uv) @ slopes.mT
@@ -148,19 +149,10 @@ class Turn(NamedTuple):
             uv: the pixels before the turn. matrix: K of both.
         """
         rays = torch.linalg.solve_triangular(
-            matrix.to(uv).mT, _homogeneous(uv), upper=False, left=False
+            matrix.to(uv).mT, homogeneous_pixels(uv), upper=False, left=False
         )
         turned = rays @ self.rotation.to(uv).mT
         return turned[..., 2] > _LEAST_COSINE * turned.norm(dim=-1)
-
-
-def _homography(rotation: Tensor, matrix: Tensor) -> Float[Tensor, "3 3"]:
-    """Return K R K^-1."""
-    return torch.linalg.solve_triangular(matrix, matrix @ rotation, upper=True, left=False)
-
-
-def _homogeneous(uv: Tensor) -> Tensor:
-    return torch.nn.functional.pad(uv, (0, 1), value=1.0)
 
 
 def _in_front(depth: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import index_tensor, outside_inference
+from torchpose.camera._projection import homogeneous_pixels, turn_homography
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 MEMORY = 1.0
@@ -252,7 +253,7 @@ def view_body(
     offset = neck - model.neck.to(neck)
     room = _BESIDE * matrix[0, 0] / offset.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     target = model.neck.to(neck) + offset * room.clamp_max(1.0)
-    rays = _homogeneous(torch.stack([target, neck]))
+    rays = homogeneous_pixels(torch.stack([target, neck]))
     # K is triangular, so that its inverse is not needed
     rays = torch.linalg.solve_triangular(matrix.mT, rays, upper=False, left=False)
     wanted, current = _axes(rays)
@@ -296,7 +297,7 @@ def to_view(
     divides by.
     """
     centre, zoom = view.centre[..., None, :], view.zoom[..., None]
-    seen = _homogeneous(uv) @ _homography(view.rotation, matrix).mT
+    seen = homogeneous_pixels(uv) @ turn_homography(view.rotation, matrix).mT
     level, depth = seen.split([2, 1], -1)
     depth = depth.clamp_min(_LEAST_DEPTH)
     area = 2 * zoom.log() - 3 * depth[..., 0].log()
@@ -307,8 +308,8 @@ def from_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "B T J 2"], Float[Tensor, "B T J 2 2"]]:
     """Return the pixels of the virtual camera as the camera sees them, and the derivative of this map."""
-    homography = _homography(view.rotation.mT, matrix)
-    seen = _homogeneous(_shrunk(uv, view)) @ homography.mT
+    homography = turn_homography(view.rotation.mT, matrix)
+    seen = homogeneous_pixels(_shrunk(uv, view)) @ homography.mT
     level, depth = seen.split([2, 1], -1)
     top, bottom = homography[:, :, None, :, :2].split([2, 1], -2)
     slopes = top - (level / depth)[..., None] * bottom
@@ -324,7 +325,7 @@ def planes_in_view(
     Args:
         planes: (a, b). view: the virtual camera. matrix: K.
     """
-    turned = planes @ _homography(view.rotation.mT, matrix)
+    turned = planes @ turn_homography(view.rotation.mT, matrix)
     slope = turned[..., :2] / view.zoom[..., None, None]
     shift = (turned[..., :2] * view.centre[..., None, :]).sum(-1)
     zoomed = (slope * view.centre[..., None, :]).sum(-1)
@@ -335,12 +336,3 @@ def _shrunk(uv: Tensor, view: BodyView) -> Tensor:
     """Return pixels of the virtual camera without its zoom."""
     centre = view.centre[..., None, :]
     return centre + (uv - centre) / view.zoom[..., None, None]
-
-
-def _homography(rotation: Tensor, matrix: Tensor) -> Tensor:
-    """Return K R K^-1."""
-    return torch.linalg.solve_triangular(matrix, matrix @ rotation, upper=True, left=False)
-
-
-def _homogeneous(uv: Tensor) -> Tensor:
-    return torch.nn.functional.pad(uv, (0, 1), value=1.0)
