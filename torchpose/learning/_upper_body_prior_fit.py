@@ -24,14 +24,14 @@ from torchpose.learning._training import (
     arm_sources,
     collect_poses,
 )
-from torchpose.math._rotations import RotationOrder, euler_to_matrix
+from torchpose.math._rotations import euler_to_matrix
 from torchpose.priors._arm_state import (
     ANGLES,
     STATE_DIM,
-    arm_state,
     check_rotation_order,
     mirror_covariance,
     mirror_mixture,
+    turned_arm_state,
 )
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo
@@ -193,8 +193,9 @@ def increment_covs(
             used = used.repeat(-(-_STEPS // len(used)))
             sampled = sample_viewpoints(len(used), views, generator)
             joints = poses.joints * MIRROR if mirror and side == "right" else poses.joints
-            steps = _states(joints[used], arm, sampled, matrix, order)
-            steps = steps - _states(joints[used - 1], arm, sampled, matrix, order)
+            rotation = euler_to_matrix(sampled.angles, order)
+            steps = _states(joints[used], arm, sampled, rotation, matrix)
+            steps = steps - _states(joints[used - 1], arm, sampled, rotation, matrix)
             trust = _trust(poses, arm, used)
             weight = trust * _rates(poses)[used] / rate
             found[side] = (steps * weight[:, None]).mT @ steps / trust.sum()
@@ -230,12 +231,11 @@ def _states(
     joints: Float[Tensor, "n 8 3"],
     arm: tuple[int, ...],
     views: Viewpoints,
+    rotation: Float[Tensor, "n 3 3"],
     matrix: Tensor,
-    order: RotationOrder,
 ) -> Float[Tensor, "n 21"]:
     """Return states of poses centred on their neck, whose position goes into the camera's translation."""
     neck = joints[:, _NECK]
-    rotation = euler_to_matrix(views.angles, order)
     place = views.translation + (rotation @ neck[..., None])[..., 0]
     points = joints[:, list(arm)] - neck[:, None]
-    return arm_state(points, Viewpoints(views.angles, place), matrix, order)
+    return turned_arm_state(points, Viewpoints(views.angles, place), rotation, matrix)

@@ -48,16 +48,32 @@ def arm_state(
     known_order = check_rotation_order(order)
     check_shape("points", points, (None, 5, 3))
     check_shape("views.angles", views.angles, (len(points), 3))
-    angles, translation = views.angles.to(points), views.translation.to(points)
-    rotation = euler_to_matrix(angles, known_order)
-    uvl = project(points, matrix.to(points), rotation, translation)
+    own = Viewpoints(views.angles.to(points), views.translation.to(points))
+    return turned_arm_state(points, own, euler_to_matrix(own.angles, known_order), matrix)
+
+
+def turned_arm_state(
+    points: Float[Tensor, "N 5 3"],
+    views: Viewpoints,
+    rotation: Float[Tensor, "N 3 3"],
+    matrix: Float[Tensor, "3 3"],
+) -> Float[Tensor, "N 21"]:
+    """Return states as `arm_state` does, where the rotations of the angles are known.
+
+    Args:
+        points: as of `arm_state`. views: of the same dtype. rotation: of their angles. matrix: K, pixels.
+
+    Raises:
+        InputError: a joint is behind the camera.
+    """
+    uvl = project(points, matrix.to(points), rotation, views.translation)
     nearest = uvl[..., 2].min() if len(points) else points.new_ones(())
     if bool(nearest <= 0):
         raise InputError(
             f"all joints must be in front of the camera, got one at depth {float(nearest):.3g} m; "
             "choose views with a larger tz"
         )
-    return torch.cat([uvl.flatten(1), angles, translation], -1)
+    return torch.cat([uvl.flatten(1), *views], -1)
 
 
 def arm_states(
