@@ -3,10 +3,9 @@
 import multiprocessing
 import os
 import signal
-import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 _CONTEXT = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
@@ -18,15 +17,19 @@ class ForkedFit:
 
     Args:
         arguments: of `train fit`. errors: file for what it writes. ignored: warnings that are no
-            errors in it.
+            errors in it. environment: variables that it has besides.
     """
 
     def __init__(
-        self, arguments: list[object], errors: Path, ignored: tuple[type[Warning], ...] = ()
+        self,
+        arguments: list[object],
+        errors: Path,
+        ignored: tuple[type[Warning], ...] = (),
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self._errors = errors
-        names = [str(argument) for argument in arguments]
-        self._process = _CONTEXT.Process(target=_fit, args=(names, errors, ignored))
+        given = [str(argument) for argument in arguments], errors, ignored, environment or {}
+        self._process = _CONTEXT.Process(target=_fit, args=given)
         self._process.start()
 
     @property
@@ -48,16 +51,22 @@ class ForkedFit:
         return None, self._errors.read_text(encoding="utf-8")
 
 
-def _fit(arguments: list[str], errors: Path, ignored: tuple[type[Warning], ...]) -> None:
-    from train.cli import main
+def _fit(
+    arguments: list[str],
+    errors: Path,
+    ignored: tuple[type[Warning], ...],
+    environment: Mapping[str, str],
+) -> None:
+    from train.cli import end_process, main
 
+    os.environ.update(environment)
     with errors.open("wb") as file, open(os.devnull, "wb") as nowhere:
         os.dup2(file.fileno(), 2)
         os.dup2(nowhere.fileno(), 1)
     warnings.simplefilter("error")
     for kind in (DeprecationWarning, *ignored):
         warnings.simplefilter("ignore", kind)
-    sys.exit(main(["fit", *arguments]))
+    end_process(main(["fit", *arguments]))
 
 
 def run_apart(work: Callable[[], object], timeout: float = 120) -> None:

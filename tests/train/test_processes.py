@@ -23,21 +23,11 @@ from train.cli import end_process, main
 
 ROOT = Path(__file__).parents[2]
 LOCAL = {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "GLOO_SOCKET_IFNAME": "lo"}
-STRICT = {"PYTHONWARNINGS": "error,ignore::DeprecationWarning"}
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     return write_recordings(tmp_path_factory.mktemp("people"))
-
-
-def start(arguments, *launcher):
-    """`python -m train fit ...` in a process of its own; torchrun warns, so only without it strictly."""
-    command = [sys.executable, "-m", *launcher, "train", "fit", *map(str, arguments)]
-    return subprocess.Popen(
-        command, cwd=ROOT, env={**os.environ, **LOCAL, **({} if launcher else STRICT)},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
 
 
 def end(process):
@@ -143,11 +133,22 @@ def test_only_a_process_of_several_ends_without_clearing_up(monkeypatch, grouped
     assert stopped.value.code == 3
 
 
-def node(port):
-    """torchrun as on one of two nodes with a process each."""
-    where = ("--rdzv-backend", "c10d", "--rdzv-id", "fit", "--rdzv-endpoint", f"127.0.0.1:{port}")
-    here = ("--nnodes", "2", "--nproc-per-node", "1", "--local-addr", "127.0.0.1")
-    return ("torch.distributed.run", *here, *where, "-m")
+def node_of(rank, port):
+    """What torchrun tells the process of one of two nodes."""
+    return LOCAL | {
+        "MASTER_PORT": str(port), "RANK": str(rank), "GROUP_RANK": str(rank), "LOCAL_RANK": "0",
+        "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "1", "TORCHELASTIC_RUN_ID": "fit",
+    }  # fmt: skip
+
+
+def torchrun(*arguments):
+    """Two processes that torchrun itself starts; it warns."""
+    how = ("--standalone", "--nproc-per-node", "2", "--local-addr", "127.0.0.1")
+    command = [sys.executable, "-m", "torch.distributed.run", *how, "-m", "train", "fit"]
+    return subprocess.run(
+        [*command, *map(str, arguments)], cwd=ROOT, env=os.environ | LOCAL,
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
 
 
 def free_port():
@@ -158,7 +159,7 @@ def free_port():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="SIGKILL, and the loopback's name, are Linux's")
 def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
-    """One process dies in its third step, one of two in the fifth; two that torchrun starts finish."""
+    """One process dies in its third step, one of two nodes in the fifth; two that torchrun starts finish."""
     values = settings(recordings, tmp_path / "one")
     assert main(["fit", "--config", str(write_settings(tmp_path / "one", values))]) == 0
     wanted = load_prior(tmp_path / "one" / "p.safetensors")
@@ -176,15 +177,19 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
 
     kill["init_args"] = {"step": 4, "rank": 1}
     write_settings(tmp_path / "dying", values)
-    lost = start(["--config", dying, "--ckpt_path", "last", "--trainer.devices", "2"])
-    message = end(lost)
-    assert lost.returncode != 0, message
+    port = free_port()
+    go_on = ["--config", dying, "--ckpt_path", "last"]
+    left, lost = (
+        ForkedFit(go_on, tmp_path / f"errors{rank}", environment=node_of(rank, port))
+        for rank in range(2)
+    )
+    message = end(left)
+    assert left.returncode > 0, message
+    assert end(lost) == "" and lost.returncode == -signal.SIGKILL
     assert not out.exists()
 
-    port = free_port()
-    nodes = [start(["--config", config, "--ckpt_path", "last"], *node(port)) for _ in range(2)]
-    messages = [end(process) for process in nodes]
-    assert [process.returncode for process in nodes] == [0, 0], messages
+    done = torchrun("--config", config, "--ckpt_path", "last")
+    assert done.returncode == 0, done.stderr
     prior = load_prior(out)
     assert_same(prior, wanted, 1e-8)
     assert prior.info.persons == wanted.info.persons
