@@ -73,7 +73,7 @@ def hold_out(
     """Yield every person with sequences and a tracker whose prior is of all others."""
     settings = {"seed": options.seed, "calibration_folds": 0, "name": "ub-people-by-person"}
     if options.quick:
-        settings |= QUICK | {"n_samples": 3000, "window_steps": 5}
+        settings |= QUICK | {"n_samples": 1000, "window_samples": 1000, "window_steps": 2}
     else:
         settings |= {
             "window_components": options.window_components,

@@ -44,6 +44,8 @@ PLACES = {
     "0.7 m nearer": (0.0, 0.0, -0.7),
 }
 
+_QUICK_FRAMES = 20  # of a sequence of a quick run
+
 
 def paths(name: str, poses: list[Tensor], fps: float) -> list[Tensor]:
     """Return the places of the bodies in every frame of each sequence [T, 3], metres from the usual one."""
@@ -81,18 +83,20 @@ def main(
     torch.set_num_threads(threads)
     out = check_output_folder(out)
     recordings, _ = people(data, quick)
-    sizes = (4, 8, 3000) if quick else (30, 120, 60_000)
+    sizes = (4, 8, 1000) if quick else (30, 120, 60_000)
     settings = dict(
         zip(("n_components", "window_components", "window_samples"), sizes, strict=True)
     )
     if quick:
-        settings |= {"n_samples": 3000, "window_steps": 5}
+        settings |= {"n_samples": 1000, "window_steps": 2}
     prior = cached_prior(
         out, [r for r in recordings if r.person in FITTED], fit_kinect_prior, True,
         seed=seed, calibration_folds=0, name="ub-people-places", **settings,
     )  # fmt: skip
     tracked = [r for r in recordings if r.person in TRACKED][::every]
     poses, fps = [centred_on_neck(r.upper_body().joints) for r in tracked], tracked[0].fps or 30.0
+    if quick:
+        poses = [p[:_QUICK_FRAMES] for p in poses]
     print(f"| 3D error (cm), {sum(map(len, poses)):,} frames | {' | '.join(TRACKERS)} |")
     print("| --- |" + " ---: |" * len(TRACKERS))
     for name in tqdm([*PLACES, "walking in a circle"], desc="places"):

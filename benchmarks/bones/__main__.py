@@ -68,7 +68,7 @@ def main(
     for group, name in zip(groups(data, quick), _NAMES, strict=True):
         priors = priors_of(group, data, quick)
         if pictures is not None:
-            draw(group, *priors, pictures, name)
+            draw(group, *priors, pictures, name, n_frames=1 if quick else 8)
         add_group(report, group, *priors)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))

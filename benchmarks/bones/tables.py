@@ -145,7 +145,9 @@ def add_group(report: Report, group: Group, prior: UpperBodyPrior, arms: ArmPrio
             table.add(name, scored.nanmean(0))
 
 
-def draw(group: Group, prior: UpperBodyPrior, arms: ArmPrior, folder: Path, name: str) -> None:
+def draw(
+    group: Group, prior: UpperBodyPrior, arms: ArmPrior, folder: Path, name: str, n_frames: int = 8
+) -> None:
     """Write strips of the last view of a group: windows and bones, with the truth in grey.
 
     The truth is moved so that the middles of the shoulders meet.
@@ -162,6 +164,6 @@ def draw(group: Group, prior: UpperBodyPrior, arms: ArmPrior, folder: Path, name
         found, true = middles
         figure = viz.plot_pose_strip(
             joints, truth=truth + found - true, fps=view.fps, observed=poses.observed[0],
-            title=f"{group.seen}: {method}",
+            n_frames=n_frames, title=f"{group.seen}: {method}",
         )  # fmt: skip
         viz.save_figure(figure, folder / f"{name}-{method}.png", dpi=110)

@@ -4,14 +4,14 @@
 
 100 frames of head and hands through `UpperBodyTracker` over windows, over single poses, and, for one
 sequence, as it is by default: without gradients, and forward and backward with gradients for every
-keypoint. Each case runs in a process of its own (all in one with --quick) and reports CPU seconds and the
+keypoint. Each case runs in a process of its own (with --quick in this one) and reports CPU seconds and the
 peak of its resident memory beyond what was resident before; gains and libraries are loaded before, by a
 short run.
 """
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from benchmarks._command import run_command
@@ -50,9 +50,9 @@ def main(setup: Setup = Setup()) -> None:
         cases = [Case(0, 1, 6), Case(1, 1, 6), Case(JUMPING, 1, 3)]
     ways = [(*case, on) for case in cases for on in (False, True)]
     if setup.quick:  # whose peaks mean nothing
-        results = in_new_process(ways, setup.threads)
+        results = [measure(*way) for way in ways]
     else:
-        results = [result for way in ways for result in in_new_process([way], setup.threads)]
+        results = [in_new_process(way, setup.threads) for way in ways]
     found = list(zip(results[::2], results[1::2], strict=True))
     report.table(HEADER, table_rows(cases, found))
     moved = max(result["moved"] for _, result in found)
@@ -68,28 +68,21 @@ def main(setup: Setup = Setup()) -> None:
         sys.exit("gradients are not those of the poses")
 
 
-def in_new_process(ways: Sequence[Way], threads: int) -> list[dict[str, Any]]:
-    """Call `measure_all` in a new process; a peak is that of one way."""
-    found: list[dict[str, Any]] = call_in_new_process(
-        threads, _MODULE, measure_all.__name__, list(ways)
-    )
+def in_new_process(way: Way, threads: int) -> dict[str, Any]:
+    """Call `measure` in a new process, so that a peak is its own."""
+    found: dict[str, Any] = call_in_new_process(threads, _MODULE, measure.__name__, *way)
     return found
 
 
-def measure_all(ways: Sequence[Way]) -> list[dict[str, Any]]:
-    """Call `measure` for some cases, with or without gradients."""
-    return [measure(Case(*case), gradients) for *case, gradients in ways]
-
-
-def measure(case: Case, gradients: bool) -> dict[str, Any]:
+def measure(method: int, batch: int, frames: int, gradients: bool) -> dict[str, Any]:
     """Track once: CPU seconds, bytes beyond what was there, and agreement with and of gradients."""
     import torch
 
     from torchpose import UpperBodyTracker, load_prior
 
     prior = load_prior("kinect-upper-body")
-    tracker = UpperBodyTracker(prior, camera=prior.camera, method=METHODS[case.method])
-    keypoints = draw_keypoints(case.batch, case.frames)
+    tracker = UpperBodyTracker(prior, camera=prior.camera, method=METHODS[method])
+    keypoints = draw_keypoints(batch, frames)
     with torch.no_grad():
         plain = tracker(keypoints, names=NAMES)  # gains are known from here on
     if gradients:
@@ -113,7 +106,7 @@ def measure(case: Case, gradients: bool) -> dict[str, Any]:
             for name in ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
             for value in (getattr(plain, name),)
         )
-        slope = 0.0 if case.method == JUMPING else slope_error(tracker, keypoints)
+        slope = 0.0 if method == JUMPING else slope_error(tracker, keypoints)
         return {**numbers, "moved": moved, "slope": slope}
 
 
