@@ -17,8 +17,8 @@ def pytest_addoption(parser):
     parser.addoption(
         "--fuzz-seconds",
         type=float,
-        default=5.0,
-        help="processor time for damaged files and odd calls (tests/fuzz; default 5)",
+        default=3.0,
+        help="processor time for damaged files and odd calls (tests/fuzz; default 3)",
     )
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from torchpose.math import euler_to_matrix
 from torchpose.priors import load_prior
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, UPPER_BODY
 from torchpose.upper_body import PoseTrack
+from torchpose.whole_body import find_first_pose
 
 
 @pytest.fixture
@@ -53,7 +55,8 @@ def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
     assert table["2D error, all joints (pixels)"][2] == "-"
     assert "right hand while hidden (30 frames)" in table
 
-    tracked = torchpose("track", out / "keypoints.npz", "--out", tmp_path / "again")
+    again = ("--out", tmp_path / "again", "--pictures", "false")
+    tracked = torchpose("track", out / "keypoints.npz", *again)
     assert tracked.code == 0, tracked.err
     again = PoseTrack.load(tmp_path / "again" / "poses.npz")
     torch.testing.assert_close(again.joints3d, poses.joints3d, rtol=0, atol=1e-9)
@@ -119,6 +122,8 @@ def walked(tmp_path_factory):
     out, printed = tmp_path_factory.mktemp("walk") / "walk", io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setattr(demo_walk, "_PARTICLES", 100)
+        search = partial(find_first_pose, n_particles=600, n_tracking=100)  # a third of the usual
+        patch.setattr("torchpose.whole_body._particle_follower.find_first_pose", search)
         patch.delenv("TORCHPOSE_DATA", raising=False)
         options = ["--input", "walk", "--seconds", "1", "--pictures", "false"]
         assert main(["demo", *options, "--out", str(out)]) == 0

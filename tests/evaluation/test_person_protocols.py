@@ -323,8 +323,12 @@ def test_across_data_sets(data, tmp_path):
 def test_across_any_data_sets(data, tmp_path):
     """Three folders of other names: nothing has to be made up where all have the same joints."""
     folders = [
-        write_people(tmp_path / name, persons, n_frames=110, first=first)
-        for first, name, persons in ((0, "x", "ab"), (4, "y", "cd"), (8, "z", "ef"))
+        write_people(tmp_path / name, persons, n_frames, first=first)
+        for first, name, persons, n_frames in (
+            (0, "x", "ab", 110),
+            (4, "y", "cd", 40),
+            (8, "z", "ef", 40),
+        )
     ]
     report = cross_dataset.run(
         folders, tmp_path / "out", progress=False, recipe=recipe, tested=("c",)
