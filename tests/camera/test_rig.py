@@ -9,7 +9,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpose.camera import CameraRig, PinholeCamera, save_cameras
-from torchpose.camera._rig import as_rig, undistortion_maps
+from torchpose.camera._lens import undistortion_maps
+from torchpose.camera._rig import as_rig
 from torchpose.errors import CameraError, InputError
 
 DISTORTIONS = (-0.25, 0.08, 0.002, -0.001)

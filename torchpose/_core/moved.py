@@ -151,7 +151,8 @@ NAMES: dict[str, dict[str, str]] = {
             "arm_in_body_frame arm_in_camera_frame backproject check_intrinsics intrinsics join_arms "
             "map_pixel_covariance pixel_covariances"
         ),
-        "camera._rig": "RigView as_rig undistortion_maps",
+        "camera._lens": "undistortion_maps",
+        "camera._rig": "RigView as_rig",
         "camera._viewpoints": "PAPER_VIEWS Viewpoints",
         "math._rotations": (
             "ROTATION_ORDERS RotationOrder euler_to_matrix matrix_to_euler rotvec_to_matrix"

@@ -11,9 +11,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchpose.camera._lens import is_distorted
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.camera._projection import intrinsics
-from torchpose.camera._rig import CameraRig, is_distorted, scale_matrix
+from torchpose.camera._projection import intrinsics, scale_matrix
+from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError
 
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored

@@ -90,6 +90,23 @@ def homogeneous_pixels(uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3
     return torch.nn.functional.pad(uv, (0, 1), value=1.0)
 
 
+def scale_matrix(
+    matrix: Float[Tensor, "*batch 3 3"], sx: Tensor | float, sy: Tensor | float
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return K of images that are scaled by sx and sy, pixel centres at whole numbers.
+
+    Args:
+        matrix: K. sx, sy: new by old width and height, numbers or of the batch's shape.
+    """
+    scaled = matrix.clone()
+    sx, sy = (torch.as_tensor(s).to(matrix) for s in (sx, sy))
+    scaled[..., 0, :] *= sx[..., None]
+    scaled[..., 1, :] *= sy[..., None]
+    scaled[..., 0, 2] += (sx - 1) / 2
+    scaled[..., 1, 2] += (sy - 1) / 2
+    return scaled
+
+
 def lift(
     uvl: Float[Tensor, "... J 3"],
     K: Float[Tensor, "... 3 3"],

@@ -127,7 +127,7 @@ def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
     """
     import torch
 
-    from torchpose.camera._rig import distort_rays, straighten_rays
+    from torchpose.camera._lens import distort_rays, straighten_rays
 
     points = joints.detach().cpu().double() @ camera.rotation_matrix.mT + camera.translation
     straight, lens = points[:, :2] / points[:, 2:], (camera.distortions, camera.fisheye)

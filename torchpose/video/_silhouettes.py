@@ -14,9 +14,9 @@ from torch import Tensor
 from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
 from torchpose.camera._choice import is_padded
+from torchpose.camera._lens import undistortion_maps
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.camera._projection import intrinsics
-from torchpose.camera._rig import scale_matrix, undistortion_maps
+from torchpose.camera._projection import intrinsics, scale_matrix
 from torchpose.errors import CameraError, InputError
 from torchpose.measure._brightness_background import BrightnessBackground, PixelKind
 from torchpose.video._source_interface import VideoFrame, VideoSource
