@@ -112,18 +112,19 @@ def run(
         "learning-curve", seed, quick, n_components, window_components, window_samples, 0
     )
     scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
-    jobs: dict[tuple[str, int, int], Job] = {}
-    own: dict[tuple[str, str, str], Job] = {}
     divided = [name for name, group in persons.items() if len(group) > 1]
-    for name, recipe in known:
-        for count in counts:
-            for i, subset in enumerate(cyclic_subsets(list(persons), count, n_subsets)):
-                jobs[name, count, i] = _curve_job(
-                    persons, others, subset, count, settings, recipe, scoring
-                )
-        for person in divided[:n_own]:
-            for kind, job in _own_jobs(persons, person, settings, recipe, scoring).items():
-                own[name, person, kind] = job
+    jobs = {
+        (name, count, i): _curve_job(persons, others, subset, count, settings, recipe, scoring)
+        for name, recipe in known
+        for count in counts
+        for i, subset in enumerate(cyclic_subsets(list(persons), count, n_subsets))
+    }
+    own = {
+        (name, person, kind): job
+        for name, recipe in known
+        for person in divided[:n_own]
+        for kind, job in _own_jobs(persons, person, settings, recipe, scoring).items()
+    }
     folder = check_output_folder(fits or out)
     found = run_jobs([*jobs.values(), *own.values()], folder, workers, progress)
     scores = dict(zip([*jobs, *own], found, strict=True))

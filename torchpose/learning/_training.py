@@ -130,18 +130,9 @@ def collect_poses(
     joints = [b.joints.to(torch.float64) for b in bodies]
     extra: dict[str, Any] = {"head": head}
     if any(kind != wanted for kind in kinds):
-        genuine = [j for j, kind in zip(joints, kinds, strict=True) if kind == wanted]
-        beside = [r.upper_body(nose_as_head) for r in others] if not genuine else []
-        genuine = genuine or [b.joints.to(torch.float64) for b in beside if b.neck == wanted]
-        offset = learn_neck_offset(torch.cat(genuine) if genuine else joints[0][:0])
-        joints = [
-            j if kind == wanted else place_neck(j, offset)
-            for j, kind in zip(joints, kinds, strict=True)
-        ]
-        extra["neck_offset"] = offset._asdict()
-        extra["frames_with_converted_neck"] = sum(
-            len(j) for j, kind in zip(joints, kinds, strict=True) if kind != wanted
-        )
+        beside = [] if wanted in kinds else [r.upper_body(nose_as_head) for r in others]
+        joints, of_necks = _with_neck(wanted, joints, kinds, beside)
+        extra |= of_necks
     rate = _frame_rate(recordings, joints)
     facts = {
         "neck": wanted,
@@ -160,6 +151,29 @@ def collect_poses(
         [float(r.fps or rate or DEFAULT_RATE) for r in recordings],
         [r.person_id for r in recordings],
     )
+
+
+def _with_neck(
+    wanted: str,
+    joints: Sequence[Tensor],
+    kinds: Sequence[str | None],
+    beside: Sequence[Any],
+) -> tuple[list[Tensor], dict[str, Any]]:
+    """Return joints with necks of one kind, and facts about those that were converted.
+
+    Args:
+        wanted: kind of neck. joints: of each recording. kinds: of their necks.
+        beside: bodies that tell where the neck is, if none of these has one of that kind.
+    """
+    genuine = [j for j, kind in zip(joints, kinds, strict=True) if kind == wanted]
+    genuine = genuine or [b.joints.to(torch.float64) for b in beside if b.neck == wanted]
+    offset = learn_neck_offset(torch.cat(genuine) if genuine else joints[0][:0])
+    placed = [
+        j if kind == wanted else place_neck(j, offset)
+        for j, kind in zip(joints, kinds, strict=True)
+    ]
+    count = sum(len(j) for j, kind in zip(joints, kinds, strict=True) if kind != wanted)
+    return placed, {"neck_offset": offset._asdict(), "frames_with_converted_neck": count}
 
 
 def short_paths(poses: PoseSet, room: float) -> PoseSet:

@@ -34,9 +34,10 @@ from torchpose.viz._style import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 else:
-    Figure = Any
+    Axes = Figure = Any
 
 CURVE_JOINTS = ("hand_left", "elbow_left", "hand_right", "elbow_right")
 ERROR_JOINTS = ("hand_left", "hand_right", "elbow_left", "elbow_right", "shoulder_left",
@@ -94,22 +95,15 @@ def plot_joint_curves(
             ax = style_axes(grid[row, d], "time (s)" if row == len(rows) - 1 else "")
             if row == 0:
                 ax.set_title(axes_names[d], fontsize=NORMAL, color=INK)
-            middle = to_numpy(joints[:, joint, d])
             if observed is not None and not never:
                 for start, stop in _spans(~observed[:, joint]):
                     ends = ((first_frame + start) / fps, (first_frame + stop) / fps)
                     ax.axvspan(*ends, color=_GAP, linewidth=0, zorder=0)
-            if covariance is not None:
-                spread = half * to_numpy(covariance[:, joint, d, d]) ** 0.5
-                ax.fill_between(
-                    time, middle - spread, middle + spread, color=colors[joint], alpha=0.2,
-                    linewidth=0,
-                )  # fmt: skip
-            if truth is not None:
-                ax.plot(time, to_numpy(truth[:, joint, d]), color=INK, linewidth=1.1,
-                        linestyle=_DASHED)  # fmt: skip
-            ax.plot(time, middle, color=colors[joint], linewidth=1.5)
-            ax.margins(x=0)
+            _draw_curve(
+                ax, time, joints[:, joint, d], colors[joint],
+                None if covariance is None else half * to_numpy(covariance[:, joint, d, d]) ** 0.5,
+                None if truth is None else truth[:, joint, d],
+            )  # fmt: skip
             if dims == 2 and d == 1:
                 ax.invert_yaxis()
         note = "\n(inferred throughout)" if never else ""
@@ -125,6 +119,19 @@ def plot_joint_curves(
     figure.align_ylabels(grid[:, 0])
     add_legend(figure, entries)
     return figure
+
+
+def _draw_curve(
+    ax: Axes, time: Any, values: Tensor, color: str, spread: Any, truth: Tensor | None
+) -> None:
+    """Draw one coordinate over time, a band of this half width about it, and the true one."""
+    middle = to_numpy(values)
+    if spread is not None:
+        ax.fill_between(time, middle - spread, middle + spread, color=color, alpha=0.2, linewidth=0)
+    if truth is not None:
+        ax.plot(time, to_numpy(truth), color=INK, linewidth=1.1, linestyle=_DASHED)
+    ax.plot(time, middle, color=color, linewidth=1.5)
+    ax.margins(x=0)
 
 
 def _indices(names: Sequence[str]) -> list[int]:
