@@ -36,8 +36,8 @@ def keypoints_alone(method: str, silhouettes: Any, keypoints: Any) -> Any:
     if silhouettes is not None:
         given = "silhouettes" if keypoints is None else "both"
         raise InputError(
-            f"method {method} takes keypoints and no silhouettes, got {given}; other methods "
-            "take either or both"
+            f"method {method} takes keypoints and no silhouettes, got {given}; keypoints are "
+            "given by name, and other methods take either or both"
         )
     if keypoints is None:
         raise InputError(f"method {method} takes keypoints, got none")
