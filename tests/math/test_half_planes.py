@@ -55,6 +55,14 @@ def test_evidence_of_nothing_changes_nothing():
     assert float(log_outside(torch.tensor([[-3.0], [3.0]]), torch.zeros(2)).abs().max()) == 0
 
 
+def test_the_mass_outside_is_the_one_by_logarithms():
+    distance = torch.linspace(-45.0, 45.0, 400, dtype=torch.float64).view(4, -1).mT
+    log_inside = torch.linspace(-8.0, 0.0, len(distance), dtype=torch.float64)
+    inside = torch.special.log_ndtr(-distance).sum(-1) + torch.log(-torch.expm1(log_inside))
+    expected = torch.log1p(-inside.exp())
+    torch.testing.assert_close(log_outside(distance, log_inside), expected, rtol=1e-12, atol=1e-15)
+
+
 def test_far_points_stay_finite_and_as_they_are():
     """Of what is far inside the likelihood is that of the region, of what is far outside it is one."""
     mean = torch.tensor([[300.0, -1e5], [300.0, 1e5]], dtype=torch.float64)

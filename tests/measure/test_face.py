@@ -100,6 +100,18 @@ def test_known_faces_are_searched_where_they_are():
     assert later[0].smallest == pytest.approx(67.5, abs=2)
 
 
+def test_frames_without_a_search_need_no_image():
+    tracker, states, detector = follow([[[300.0, 200.0, 90.0]]] * 12, every=2, whole_every=10)
+    before, image = [tracker.init(), *states[:-1]], np.full((480, 640), 3, np.uint8)
+    skipped = [t for t, tracks in enumerate(before) if not tracker.searches(tracks)]
+    assert skipped == [3, 5, 7, 9, 11]
+    detector.asked.clear()
+    for t, tracks in enumerate(before):
+        after = tracker.step(tracks, image if tracker.searches(tracks) else None)
+        assert torch.equal(after.mean, states[t].mean) and after.frame == t + 1
+    assert len(detector.asked) == 12 - len(skipped) + 1  # in one of them everywhere too
+
+
 def test_without_a_face_the_whole_image_is_searched_now_and_then():
     _, _, detector = follow([[]] * 11, search_every=5)
     small = Region(0, 0, 640, 480, 11.0, 40.0)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.special import log_ndtr
+from torch.special import log_ndtr, ndtr
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -35,8 +35,8 @@ def log_outside(
         log_inside: log rho, the log of how likely the observation is in the region, relative to outside; at
             most 0.
     """
-    inside = log_ndtr(-distance).sum(-1) + torch.log(-torch.expm1(log_inside))
-    return torch.log1p(-inside.exp())
+    # the logarithm of Phi takes ten times as long, and its exponential was needed
+    return torch.log1p(torch.expm1(log_inside) * ndtr(-distance).prod(-1))
 
 
 def outside_moments(

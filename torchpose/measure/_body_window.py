@@ -19,7 +19,7 @@ from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
 from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
-from torchpose.measure._brightness import brightened, gain_to
+from torchpose.measure._brightness import brightened, gain_to, quantile_of_bytes
 from torchpose.measure._skin import SkinModel
 
 CELL = 0.1  # side of a cell, in B
@@ -143,8 +143,8 @@ def cut_colours(
 
 def _brightest(window: Image) -> float:
     """Return the brightness of the brightest parts of a window, or of its face if that is brighter."""
-    face = float(np.quantile(window[_FACE_PART], 0.9))
-    return face if face >= _DARK else max(face, float(np.quantile(window[::8, ::8], 0.98)))
+    face = quantile_of_bytes(window[_FACE_PART], 0.9)
+    return face if face >= _DARK else max(face, quantile_of_bytes(window[::8, ::8], 0.98))
 
 
 def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:

@@ -15,7 +15,7 @@ from torchpose._core.checks import check_finite, check_grey, check_shape
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
-from torchpose.measure._brightness import brightened, gain_to
+from torchpose.measure._brightness import brightened, gain_to, quantile_of_bytes
 
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
@@ -146,7 +146,7 @@ class HaarFaceDetector:
 
 def _brightened(image: Image) -> Image:
     """Return the image, multiplied if its brightest parts are dark."""
-    return brightened(image, gain_to(_BRIGHT, float(np.quantile(image[::4, ::4], 0.98))))
+    return brightened(image, gain_to(_BRIGHT, quantile_of_bytes(image[::4, ::4], 0.98)))
 
 
 def _resized(image: Image, scale: float) -> Image:
@@ -274,20 +274,26 @@ class FaceTracker(nn.Module):
         enough = tracks.hits >= self.min_hits
         return enough & ~_on_somebody(tracks.mean[:, :3], enough)
 
-    def step(self, tracks: FaceTracks, image: Image) -> FaceTracks:
+    def searches(self, tracks: FaceTracks) -> bool:
+        """Return whether faces are searched for in the next frame, so that `step` needs its image."""
+        known = bool(self.usable(tracks).any())
+        return not known or not (tracks.frame % self.every and tracks.frame % self.whole_every)
+
+    def step(self, tracks: FaceTracks, image: Image | None) -> FaceTracks:
         """Return the faces of the next frame.
 
         Args:
-            tracks: from `init` or the step before. image: grey, [H, W], uint8.
+            tracks: from `init` or the step before.
+            image: grey, [H, W], uint8; may be None where `searches` is False.
 
         Raises:
             InputError: another kind of image.
         """
+        predicted = self._predict(tracks)
+        if image is None or not self.searches(tracks):
+            return predicted
         known = bool(self.usable(tracks).any())
         everywhere = tracks.frame % (self.whole_every if known else self.search_every) == 0
-        predicted = self._predict(tracks)
-        if known and not everywhere and tracks.frame % self.every:
-            return predicted
         found = [self._look_near(image, face) for face in predicted.mean[:, :3].tolist()]
         if everywhere:  # last, since sizes of known faces are measured better near them
             used = predicted.mean[self.usable(predicted), 2]

@@ -147,8 +147,9 @@ class HandNetwork(FittedNetwork):
         """
         there = inside > 0.5
         if not bool(there.all()):  # the border of an image goes on beyond it
-            beyond = interpolate(there.to(colours), scale_factor=4.0) == 0
-            colours = colours.masked_fill(beyond, -_MOST)
+            kept = interpolate(there.to(colours), scale_factor=4.0)
+            # filling by a mask takes twenty times as long
+            colours = torch.addcmul((kept - 1) * _MOST, colours, kept)
         return self.colours(colours)  # type: ignore[no-any-return]
 
     def features(

@@ -235,8 +235,9 @@ class HandTracker(nn.Module):
             log_likelihood = self.settings.beside_network * log_likelihood + found.log_prob
             state = state._replace(gone=self._gone(state.gone, found.gone))
         rebirth = self._rebirth(view, expected)
-        new = state.frames == 0
-        belief = torch.where(new[:, None, None, None], rebirth, state.cells)
+        belief, new = state.cells, state.frames == 0
+        if bool(new.any()):
+            belief = torch.where(new[:, None, None, None], rebirth, belief)
         belief = self._filter(state, belief, rebirth, log_likelihood, view)
         state, hands = self._measure(state._replace(cells=belief), means[:, 1], view)
         if found is not None and self.elbows:

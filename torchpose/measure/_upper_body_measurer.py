@@ -226,6 +226,8 @@ class UpperBodyMeasurer(nn.Module):
         import cv2
 
         check_rgb("a frame", image)
+        if not self.face_tracker.searches(tracks):
+            return self.face_tracker.step(tracks, None)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         scale = _face_scale(image)
         if scale < 1:
