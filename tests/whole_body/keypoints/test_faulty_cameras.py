@@ -19,10 +19,15 @@ from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
-from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults, without_still
+from torchpose.whole_body._keypoints.faulty_cameras import (
+    CameraFaults,
+    find_faults,
+    looked_at_again,
+    without_still,
+)
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_notes import notes_on_a_rolled_camera
-from torchpose.whole_body._keypoints.turned_cameras import find_turns, turned
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, turned
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +59,8 @@ def test_turns_are_found_and_keypoints_turned_back(three):
     maps, frame = RigMaps.of(rig), frame_of(rig(three.joints).pixels[0])
     wrong = frame._replace(pixels=three.rig(three.joints).pixels[:1])
     found = find_turns(wrong, torch.tensor([[False, True, False]]), maps)
-    cosine = (found.matrix.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-    assert torch.rad2deg(cosine.clamp(-1, 1).arccos())[0].tolist() == pytest.approx(
-        [0.0, 5.0, 0.0], abs=0.05
-    )
+    angles = torch.rad2deg(angles_of(found.matrix))[0].tolist()
+    assert angles == pytest.approx([0.0, 5.0, 0.0], abs=0.05)
     back = turned(wrong, found.matrix, maps)
     assert float((back.pixels - frame.pixels).abs().max()) < 1.5
 
@@ -76,6 +79,49 @@ def test_cameras_that_are_all_turned_agree_again(three):
     found = track(three.keypoints, rig)
     assert float(found.details["inlier"][10:].mean()) > 0.8
     assert any("against the calibration" in note for note in found.notes)
+
+
+def turned_scene(three, degrees):
+    """A rig whose cameras are turned by so much each, its filter, and frames of the scene's keypoints."""
+    rig = three.rig
+    for camera, angle in enumerate(degrees):
+        rig = with_turn(rig, camera, angle)
+    filter = BodyTracker(rig, "kalman", fps=FPS).by_keypoints.tracker.filter
+    return rig, filter, [frame_of(keypoints) for keypoints in three.keypoints]
+
+
+def test_turns_become_better_known_with_more_frames(three):
+    rig, filter, frames = turned_scene(three, (3.0, -3.0, 3.0))
+    faults, _, better = find_faults(filter, frames[0], CameraFaults.none(frames[0]))
+    assert bool(better.all())
+    true = three.rig.rotation.mT @ rig.rotation
+    errors = [angles_of(faults.turn[0] @ true.mT).mean()]
+    for frame in frames[1:]:
+        faults = looked_at_again(filter, faults, frame)
+        errors.append(angles_of(faults.turn[0] @ true.mT).mean())
+    assert float(faults.looks.count[0]) == 5.0
+    assert float(errors[-1]) < 0.6 * float(errors[0])
+
+
+def test_what_is_known_of_turns_outlasts_another_search(three):
+    _, filter, frames = turned_scene(three, (0.0, 5.0, 0.0))
+    faults, _, _ = find_faults(filter, frames[0], CameraFaults.none(frames[0]))
+    again, _, better = find_faults(filter, frames[1], faults)
+    assert not bool(better.any())
+    assert torch.equal(again.turn, faults.turn) and bool(again.doubted < 0)
+
+
+def test_cameras_that_turn_out_to_be_right_are_no_longer_turned_back(three):
+    _, filter, frames = turned_scene(three, (0.0, 0.0, 0.0))
+    wrong = frames[0].pixels.clone()
+    wrong[:, 1] += 60.0
+    faults, _, _ = find_faults(
+        filter, frames[0]._replace(pixels=wrong), CameraFaults.none(frames[0])
+    )
+    assert bool(faults.wrong.all())
+    for frame in frames[1:]:
+        faults = looked_at_again(filter, faults, frame)
+    assert not bool(faults.wrong.any()) and not bool(angles_of(faults.turn).any())
 
 
 def test_right_cameras_stay_as_they_are(three):

@@ -29,7 +29,8 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 from torchpose.whole_body._keypoints.keypoint_start import start
-from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.turn_looks import TurnLooks, free_turns, looked_again
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, is_turned, turned
 
 LEAST_CAMERAS = 3
@@ -55,6 +56,8 @@ class CameraFaults(NamedTuple):
         doubted: [B], frames in a row in which a camera has seen something else, below 0 after a search.
         back: [B, C], frames in a row in which one that counts not has seen the body.
         pixels, inlier: [B, C, J, 2], [B, C, J], keypoints of the frame before, as they were detected.
+        still: [B, C], frames in a row in which keypoints of a camera were those of the frame before.
+        looks: frames from which turns are estimated again.
     """
 
     turn: Tensor
@@ -64,6 +67,8 @@ class CameraFaults(NamedTuple):
     back: Tensor
     pixels: Tensor
     inlier: Tensor
+    still: Tensor
+    looks: TurnLooks
 
     @classmethod
     def none(cls, frame: KeypointFrame) -> Self:
@@ -73,16 +78,32 @@ class CameraFaults(NamedTuple):
         no = torch.zeros(shape, dtype=torch.bool, device=frame.inlier.device)
         return cls(
             torch.eye(3).to(frame.pixels).expand(*shape, 3, 3), no, no[:, 0], new(shape[0]),
-            new(shape), frame.pixels, torch.zeros_like(frame.inlier),
+            new(shape), frame.pixels, torch.zeros_like(frame.inlier), new(shape),
+            TurnLooks.none(frame),
         )  # fmt: skip
 
 
 def corrected(frame: KeypointFrame, faults: CameraFaults, maps: RigMaps) -> KeypointFrame:
     """Return keypoints as cameras would see them that are right, without those of cameras that are off."""
-    if bool(faults.wrong.any()):
-        frame = turned(frame, faults.turn, maps)
-        frame = frame._replace(inlier=frame.inlier.masked_fill(faults.off[..., None], 0.0))
-    return frame
+    return _righted(frame, faults.turn, faults.off, maps) if bool(faults.wrong.any()) else frame
+
+
+def _righted(
+    frame: KeypointFrame,
+    turn: Float[Tensor, "B C 3 3"],
+    off: Bool[Tensor, "B C"],
+    maps: RigMaps,
+) -> KeypointFrame:
+    """Return keypoints turned back, without those of cameras that are off."""
+    frame = turned(frame, turn, maps)
+    return frame._replace(inlier=frame.inlier.masked_fill(off[..., None], 0.0))
+
+
+def noted(faults: CameraFaults, frame: KeypointFrame, used: KeypointFrame) -> CameraFaults:
+    """Return the faults with a frame kept for the next one, and of `without_still` what of it is used."""
+    there, use = ((one.inlier > 0).any(-1) for one in (frame, used))
+    still = torch.where(there & ~use, faults.still + 1, 0.0)
+    return faults._replace(pixels=frame.pixels, inlier=frame.inlier, still=still)
 
 
 def without_still(frame: KeypointFrame, faults: CameraFaults) -> KeypointFrame:
@@ -100,64 +121,108 @@ def without_still(frame: KeypointFrame, faults: CameraFaults) -> KeypointFrame:
     return frame._replace(inlier=frame.inlier.masked_fill(still[..., None], 0.0))
 
 
+class _Explanations(NamedTuple):
+    """Holds N explanations of what C cameras see of B persons.
+
+    Attributes:
+        turn: [B, N, C, 3, 3], of cameras. off: [B, N, C], which count not. price: [B, N], of log-evidence.
+        n_turns: how many of them, the first ones, are those of `free_turns`.
+    """
+
+    turn: Tensor
+    off: Tensor
+    price: Tensor
+    n_turns: int
+
+
 def find_faults(
-    filter: BodyKalmanFilter, frame: KeypointFrame, faults: CameraFaults
+    filter: BodyKalmanFilter,
+    frame: KeypointFrame,
+    faults: CameraFaults,
+    begun: CorrectedBody | None = None,
 ) -> tuple[CameraFaults, CorrectedBody, Bool[Tensor, " B"]]:
     """Return the likeliest faults of cameras, who begins anew with them, and whether they are new.
 
     Args:
         filter: that tracks on. frame: keypoints as they were detected. faults: that were known so far.
+        begun: who has just begun with these, if all have.
     """
-    plain = start(filter, frame)
-    tried, price = _explanations(frame, filter.maps)
-    n = len(tried.off) // len(frame.pixels)
-    every = torch.arange(len(frame.pixels), device=price.device)
+    known = start(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
+    least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) + _LEAST_GAIN
+    tried = _explanations(frame, filter.maps)
+    count, n = tried.price.shape
+    every = torch.arange(count, device=tried.price.device)
+    turn, off = tried.turn.flatten(0, 1), tried.off.flatten(0, 1)
     given = frame.take(every.repeat_interleave(n))
-    right = corrected(given, tried, filter.maps)
+    right = _righted(given, turn, off, filter.maps)
     found = start(filter, right, _HEADINGS)
-    unexplained = (given.inlier > 0) & tried.off[..., None]
-    nobody = (unexplained * filter.maps.log_area[:, None]).sum((-2, -1))
-    evidence = found.log_evidence - nobody - price
-    refused = _enough(right) & _few_or_wide(found, right) | (angles_of(tried.turn) > _FARTHEST_TURN)
-    evidence = torch.where(refused.any(-1), -math.inf, evidence).view(-1, n)
+    evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
+    wrong = (off | is_turned(turn)).any(-1)
+    refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
+    evidence = torch.where(refused.any(-1) & wrong, -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
-    better = evidence.amax(-1) > plain.log_evidence + _LEAST_GAIN
-    rows = better.nonzero().squeeze(-1)
-    none = CameraFaults.none(frame)
+    better = evidence.amax(-1) > least
+    looks = TurnLooks.begun(frame, tried.turn[:, : tried.n_turns])
+    looks = looks._replace(count=is_turned(turn[best]).any(-1).to(looks.count))
     pause = torch.full_like(faults.doubted, -_PAUSE * filter.fps)
-    after = none._replace(doubted=torch.where(better, 0.0, pause))
-    chosen = taken(tried, best[rows])
-    after = mapped(lambda old, new: old.index_copy(0, rows, new), after, chosen)
-    after = after._replace(pixels=faults.pixels, inlier=faults.inlier)
-    return after, plain.put(rows, found.take(best[rows])), better | faults.wrong
+    new = faults._replace(
+        turn=turn[best],
+        off=off[best],
+        wrong=wrong[best],
+        back=torch.zeros_like(faults.back),
+        looks=looks,
+    )
+    rows = better.nonzero().squeeze(-1)
+    after = mapped(
+        lambda old, other: old.index_copy(0, rows, other[rows]),
+        faults, new,
+    )  # fmt: skip
+    after = after._replace(doubted=torch.where(better, 0.0, pause))
+    return after, known.put(rows, found.take(best[rows])), better
 
 
-def _explanations(frame: KeypointFrame, maps: RigMaps) -> tuple[CameraFaults, Float[Tensor, " N"]]:
-    """Return explanations of frames, those of one after the other, and what they cost in log-evidence."""
+def _of_nobody(
+    frame: KeypointFrame, off: Bool[Tensor, "B C"], maps: RigMaps
+) -> Float[Tensor, " B"]:
+    """Return minus the log density of keypoints of cameras that are off, which may be anywhere."""
+    of_nobody = (frame.inlier > 0) & off[..., None]
+    return (of_nobody * maps.log_area[:, None]).sum((-2, -1))
+
+
+def _explanations(frame: KeypointFrame, maps: RigMaps) -> _Explanations:
+    """Return explanations of frames."""
     count, n_cameras = frame.inlier.shape[:2]
-    one = torch.eye(n_cameras, dtype=torch.bool, device=frame.inlier.device)
-    free = torch.cat([one, torch.ones_like(one[:1])])
-    some_off = [one]
+    free = free_turns(n_cameras, frame.inlier.device)
+    rows = torch.arange(count, device=free.device).repeat_interleave(len(free))
+    turns = find_turns(frame.take(rows), free.repeat(count, 1), maps)
+    some_off = [one := free[:n_cameras]]
     if 3 < n_cameras <= _MOST_PAIRS:
         pairs = [list(pair) for pair in combinations(range(n_cameras), 2)]
         some_off.append(torch.stack([~one[pair].any(0) for pair in pairs]))
-    off = torch.cat(some_off)
-    none = torch.zeros_like
-    free, off = (
-        torch.cat(parts).repeat(count, 1) for parts in ((free, none(off)), (none(free), off))
-    )
-    n = len(free) // count
-    rows = torch.arange(count, device=free.device).repeat_interleave(n)
-    tried = CameraFaults.none(frame.take(rows))
-    some = free.any(-1).nonzero().squeeze(-1)
-    turns = find_turns(frame.take(rows[some]), free[some], maps)
-    price = frame.inlier.new_zeros(len(free)).index_copy(0, some, turns.price)
-    tried = tried._replace(
-        turn=tried.turn.index_copy(0, some, turns.matrix),
-        off=off,
-        wrong=torch.ones_like(tried.wrong),
-    )
-    return tried, price
+    off = torch.cat([torch.zeros_like(free), *some_off]).expand(count, -1, -1)
+    n_off = off.shape[1] - len(free)
+    turn, price = (value.unflatten(0, (count, -1)) for value in (turns.matrix, turns.price))
+    eye = torch.eye(3).to(turn).expand(count, n_off, n_cameras, 3, 3)
+    nothing = price.new_zeros(count, n_off)
+    return _Explanations(torch.cat([turn, eye], 1), off, torch.cat([price, nothing], 1), len(free))
+
+
+def looked_at_again(
+    filter: BodyKalmanFilter, faults: CameraFaults, frame: KeypointFrame
+) -> CameraFaults:
+    """Return the faults with turns estimated again from several frames.
+
+    Args:
+        filter: that tracks. faults: that are known. frame: the keypoints.
+    """
+    if not bool((faults.looks.count > 0).any()):
+        return faults
+    enough = _enough(frame).sum(-1) >= LEAST_CAMERAS
+    looks, rows, best = looked_again(faults.looks, frame, enough, filter.maps, filter.fps)
+    turn = faults.turn.index_copy(0, rows, best)
+    wrong = (faults.off | is_turned(turn)).any(-1)
+    looks = looks._replace(count=torch.where(wrong, looks.count, 0.0))
+    return faults._replace(turn=turn, wrong=wrong, looks=looks)
 
 
 def watched(

@@ -165,16 +165,19 @@ def notes_on_turned_cameras(
     """Return a note on cameras whose keypoints were turned back, if there are any.
 
     Args:
-        cameras: their names. turns: radians by which keypoints were turned.
+        cameras: their names. turns: radians by which keypoints were turned; the last ones are said, since
+            later frames tell them better.
         first_frame: number of the first of the frames.
     """
     degrees = torch.rad2deg(turns)
     much = degrees > _LEAST_TURN
-    said = [
-        f"camera {cameras[c]} (by {float(degrees[:, c].amax()):.1f} degrees from frame "
-        f"{first_frame + int(much[:, c].int().argmax())} on)"
-        for c in much.any(0).nonzero().flatten().tolist()
-    ]
+    said = []
+    for c in much.any(0).nonzero().flatten().tolist():
+        frames = much[:, c].nonzero().flatten()
+        said.append(
+            f"camera {cameras[c]} (by {float(degrees[frames[-1], c]):.1f} degrees from frame "
+            f"{first_frame + int(frames[0])} on)"
+        )
     if not said:
         return ()
     return (

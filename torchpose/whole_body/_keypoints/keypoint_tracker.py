@@ -23,6 +23,8 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
     CameraFaults,
     corrected,
     find_faults,
+    looked_at_again,
+    noted,
     watched,
     with_returned,
     without_still,
@@ -144,6 +146,9 @@ class KeypointTracker(nn.Module):
             return self._with_lone_cameras(stream, frame, step)
         faults = CameraFaults.none(frame) if stream is None else stream.faults
         given = without_still(frame, faults)
+        if stream is not None:
+            faults = looked_at_again(self.filter, faults, given)
+            stream = stream._replace(faults=faults)
         right = corrected(given, faults, self.filter.maps)
         step = self._advanced(stream, right, predicted, waited)
         step = self._with_lone_cameras(stream, right, step)
@@ -234,10 +239,11 @@ class KeypointTracker(nn.Module):
             right: as cameras would see them that are right.
         """
         stream, pose, found = step
-        faults = stream.faults._replace(pixels=frame.pixels, inlier=frame.inlier)
+        faults = noted(stream.faults, frame, given)
         if right.inlier.shape[1] >= LEAST_CAMERAS:
             several = stream.begun & (stream.alone < 0)
-            faults, due = watched(self.filter, faults, found, right, several, pose.started)
+            fresh = pose.started & (faults.looks.count == 0)
+            faults, due = watched(self.filter, faults, found, right, several, fresh)
             if bool(faults.off.any()):
                 faults = with_returned(self.filter, faults, found, given)
             rows = due.nonzero().squeeze(-1)
@@ -250,16 +256,15 @@ class KeypointTracker(nn.Module):
         self, step: KeypointStep, frame: KeypointFrame, rows: Int[Tensor, " N"]
     ) -> KeypointStep:
         """Return the frame with some persons begun anew, if that explains what cameras see."""
-        faults, found, better = find_faults(
-            self.filter, frame.take(rows), taken(step[0].faults, rows)
-        )
-        stream, pose, _ = own = taken(step, rows)
+        stream, pose, before = taken(step, rows)
+        begun = before if bool(pose.started.all()) else None
+        faults, found, better = find_faults(self.filter, frame.take(rows), stream.faults, begun)
         stream = stream._replace(faults=faults)
         anew = stream._replace(state=found.state, lost=torch.zeros_like(stream.lost))
-        begun = anew, self._posed(anew, found, torch.ones_like(better)), found
-        kept = stream, pose, own[2]
+        explained = anew, self._posed(anew, found, torch.ones_like(better)), found
+        kept = stream, pose, before
         chosen = better.nonzero().squeeze(-1)
-        after = mapped(lambda old, new: old.index_copy(0, chosen, new[chosen]), kept, begun)
+        after = mapped(lambda old, new: old.index_copy(0, chosen, new[chosen]), kept, explained)
         return mapped(lambda old, new: old.index_copy(0, rows, new), step, after)
 
     # --- one of several cameras -------------------------------------------------------------------

@@ -17,13 +17,22 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
+from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate_all
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    KeypointFrame,
+    RigMaps,
+    Seen,
+    see,
+)
 
 _TURN = 0.02  # radians, the scale s of turns before they are estimated
 _FREEDOM = 4.0  # nu, of Student's distribution of the errors
 _WIDTHS = (400.0, 400.0, 100.0, 100.0, 25.0, 25.0, 9.0, 4.0, 2.0, *[1.0] * 6)
+_WIDTHS_OF_KNOWN = (9.0, 4.0, 1.0, 1.0)
+_RATHER_ALL = (
+    4.0  # log-odds of all cameras turned, which one that is turned by more explains nearly as well
+)
 _KNOWN = 1e12  # per square radian, the information about cameras that are not turned
 _JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cameras do
 
@@ -31,12 +40,15 @@ _JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cam
 class Turns(NamedTuple):
     """Holds turns [N, C, 3, 3] of cameras in world axes, and what each choice of free turns costs [N].
 
-    The cost is 2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2 with S the information about the turns: what free
-    turns take from the log-evidence, about Laplace's approximation.
+    `price` is what free turns take from the log-evidence, about Laplace's approximation:
+    2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2, with S the information about the turns. All cameras together
+    cost less by a constant: where all are turned, one that is said to be puts the body far away, while the
+    reverse costs little. `misfit` is what the errors of keypoints take from the log-evidence.
     """
 
     matrix: Tensor
     price: Tensor
+    misfit: Tensor
 
 
 def turned(
@@ -61,30 +73,47 @@ def angles_of(turn: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     return cosine.clamp(-1, 1).arccos()
 
 
-def find_turns(frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps) -> Turns:
-    """Return the turns of cameras that explain the keypoints of a frame.
+def find_turns(
+    frame: KeypointFrame,
+    free: Bool[Tensor, "N C"],
+    maps: RigMaps,
+    known: Float[Tensor, "N C 3 3"] | None = None,
+) -> Turns:
+    """Return the turns of cameras that explain the keypoints of a frame, or of several side by side.
 
     Args:
-        frame: the keypoints. free: which cameras may be turned. maps: the cameras.
+        frame: the keypoints [N, C, J]; those of several frames are one after the other along J.
+        free: which cameras may be turned. maps: the cameras. known: turns that are near, from which few
+            steps are taken.
     """
     rays = _rays(frame, maps)
-    joints = _first_joints(frame, free, maps)
     eye = torch.eye(3).to(rays)
-    turn, rotvec = eye.expand(*free.shape, 3, 3), rays.new_zeros(*free.shape, 3)
-    for width in _WIDTHS:
+    if known is None:
+        turn, widths, joints = (
+            eye.expand(*free.shape, 3, 3),
+            _WIDTHS,
+            _first_joints(frame, free, maps),
+        )
+    else:
+        turn, widths = known, _WIDTHS_OF_KNOWN
+        joints = triangulate_all(maps, turned(frame, turn, maps), frame.inlier > 0)
+    rotvec = 2 * matrix_to_quaternion_vector(turn)  # nearly: turns are small
+    for width in widths:
         large = 1 + rotvec.square().sum(-1) / _TURN**2
         prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
         prior = prior[..., None].expand_as(rotvec).flatten(1)
-        chol, F, b, S, g = _equations(frame, rays @ turn.mT, joints, maps, width)
+        chol, F, b, S, g, _ = _equations(frame, rays @ turn.mT, joints, maps, width)
         L = torch.linalg.cholesky((S + S.mT) / 2 + torch.diag_embed(prior))
         step = torch.cholesky_solve((-g - prior * rotvec.flatten(1))[..., None], L)
         joints = joints + torch.cholesky_solve(b + F @ step[:, None], chol).squeeze(-1)
         rotvec = rotvec + step.view_as(rotvec)
         turn = rotvec_to_matrix(step.view_as(rotvec)) @ turn
-    known = 1.5 * torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN))
-    narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - known.sum(-1)
+    known_before = 1.5 * torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN))
+    narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - known_before.sum(-1)
     spent = 2 * torch.where(free, 1 + rotvec.square().sum(-1) / _TURN**2, 1.0).log().sum(-1)
-    return Turns(torch.where(free[..., None, None], turn, eye), spent + narrowed)
+    spent = spent - _RATHER_ALL * free.all(-1).to(spent)
+    misfit = _equations(frame, rays @ turn.mT, joints, maps, 1.0)[-1]
+    return Turns(torch.where(free[..., None, None], turn, eye), spent + narrowed, misfit)
 
 
 def _first_joints(
@@ -103,29 +132,36 @@ def _equations(
     joints: Float[Tensor, "N J 3"],
     maps: RigMaps,
     width: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return a factor of the information about joints, and the normal equations with them eliminated.
 
     Returns:
         The factor [N, J, 3, 3], F [N, J, 3, 3 C] and b [N, J, 3, 1] of the joints; S [N, 3 C, 3 C] and g
-        [N, 3 C] of the turns.
+        [N, 3 C] of the turns; and what the errors cost [N].
     """
     pixels, by_ray = _pixels(rays, maps)
-    T = -by_ray @ cross_matrix(rays)
     seen = see(maps, joints)
     A, off = seen.by_joint, pixels - seen.pixels
-    size = 0.5 * A.square().sum((-2, -1))
-    variance = width * (frame.variance + frame.relative * size)
-    weight = frame.inlier * seen.in_front / (variance + off.square().sum(-1) / _FREEDOM)
-    w, r = weight[..., None, None], off[..., None]
-    Aw, Tw = (w * A).mT, (w * T).mT
-    chol = torch.linalg.cholesky((Aw @ A).sum(1) + torch.eye(3).to(A) / _JOINT_STD**2)
-    b = (Aw @ r).sum(1)
-    F = (Aw @ T).permute(0, 2, 3, 1, 4).flatten(-2)
-    solved = torch.cholesky_solve(F, chol)
-    S = _block_diagonal((Tw @ T).sum(2)) - (F.mT @ solved).sum(1)
-    g = (Tw @ r).sum(2).flatten(1) - (solved.mT @ b).sum(1).squeeze(-1)
-    return chol, F, b, S, g
+    variance, square = width * _variance(frame, seen), off.square().sum(-1)
+    trust = frame.inlier * seen.in_front
+    root = (trust / (variance + square / _FREEDOM)).sqrt()[..., None]
+    r, A = root * off, root[..., None] * A
+    T = root[..., None] * torch.linalg.cross(rays[..., None, :], by_ray)
+    F = (A.mT @ T).movedim(1, -2).flatten(-2)
+    A, T = A.transpose(1, 2).flatten(2, 3), T.flatten(2, 3)
+    chol = torch.linalg.cholesky(A.mT @ A + torch.eye(3).to(A) / _JOINT_STD**2)
+    b = A.mT @ r.transpose(1, 2).flatten(2)[..., None]
+    solved = torch.linalg.solve_triangular(chol, torch.cat([F, b], -1), upper=False).flatten(1, 2)
+    Y, y = solved[..., :-1], solved[..., -1:]
+    S = _block_diagonal(T.mT @ T) - Y.mT @ Y
+    g = (T.mT @ r.flatten(2)[..., None]).flatten(1) - (Y.mT @ y).squeeze(-1)
+    misfit = _FREEDOM / 2 * (trust * torch.log1p(square / (_FREEDOM * variance))).sum((-2, -1))
+    return chol, F, b, S, g, misfit
+
+
+def _variance(frame: KeypointFrame, seen: Seen) -> Float[Tensor, "N C J"]:
+    """Return the variances of the noise of keypoints."""
+    return frame.variance + frame.relative * 0.5 * seen.by_joint.square().sum((-2, -1))
 
 
 def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "*batch C J 3"]:
