@@ -26,7 +26,10 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
     without_still,
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
-from torchpose.whole_body._keypoints.keypoint_notes import notes_on_a_rolled_camera
+from torchpose.whole_body._keypoints.keypoint_notes import (
+    notes_on_a_rolled_camera,
+    notes_on_cameras_now,
+)
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, turned
 
 
@@ -122,6 +125,28 @@ def test_cameras_that_turn_out_to_be_right_are_no_longer_turned_back(three):
     for frame in frames[1:]:
         faults = looked_at_again(filter, faults, frame)
     assert not bool(faults.wrong.any()) and not bool(angles_of(faults.turn).any())
+
+
+def test_live_steps_say_which_cameras_are_wrong(three):
+    tracker = BodyTracker(with_turn(three.rig, 1, 5.0), "kalman", fps=FPS)
+    _, found = tracker.step(tracker.init(names=NAMES), keypoints=three.keypoints[0])
+    (note,) = found.notes
+    assert "camera c1 (by" in note and "are turned back" in note
+    tracker = BodyTracker(three.rig, "kalman", fps=FPS)
+    stream = tracker.init(names=NAMES)
+    still = three.keypoints[:1].expand_as(three.keypoints).clone()
+    still[:, :2] = three.keypoints[:, :2]
+    for keypoints in still[[0, 1, 2, 3]]:
+        stream, found = tracker.step(stream, keypoints=keypoints)
+        assert found.notes == ()
+    assert stream.filter.body.faults.still.tolist() == [[0.0, 0.0, 3.0]]
+
+
+def test_notes_of_a_live_frame():
+    count, off = torch.tensor([0.0, 29.0, 28.0]), torch.tensor([True, False, False])
+    left, out = notes_on_cameras_now("abc", count, off, torch.zeros(3))
+    assert "camera b" in left and "for 30 frames" in left and "camera a is left out" in out
+    assert notes_on_cameras_now("abc", 0 * count, off & False, torch.zeros(3)) == ()
 
 
 def test_right_cameras_stay_as_they_are(three):

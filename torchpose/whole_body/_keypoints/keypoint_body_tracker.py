@@ -50,6 +50,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     late_note,
     notes_of,
     notes_on_a_rolled_camera,
+    notes_on_cameras_now,
     notes_on_left_out_cameras,
     notes_on_size,
     notes_on_still_cameras,
@@ -224,6 +225,10 @@ class KeypointBodyTracker(nn.Module):
             found = with_time(found)
         frames = frame.map(lambda value: value[:, None])
         track = self.track(with_time(pose), frames, 0, summed_up=False, feet=found)
+        faults = mapped(lambda value: value[0], body.faults)
+        track.notes = notes_on_cameras_now(
+            self.rig.names, faults.still, faults.off, angles_of(faults.turn)
+        )
         return LiveBody(body, standing), track if bool(body.begun) else _unknown(track)
 
     def feet_of(

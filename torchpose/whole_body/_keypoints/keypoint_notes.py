@@ -174,16 +174,48 @@ def notes_on_turned_cameras(
     said = []
     for c in much.any(0).nonzero().flatten().tolist():
         frames = much[:, c].nonzero().flatten()
+        angle = f"{float(degrees[frames[-1], c]):.1f} degrees"
         said.append(
-            f"camera {cameras[c]} (by {float(degrees[frames[-1], c]):.1f} degrees from frame "
-            f"{first_frame + int(frames[0])} on)"
+            f"camera {cameras[c]} (by {angle} from frame {first_frame + int(frames[0])} on)"
         )
-    if not said:
-        return ()
+    return (_turned_back(said, "were"),) if said else ()
+
+
+def notes_on_cameras_now(
+    cameras: Sequence[str],
+    still: Float[Tensor, " C"],
+    off: Bool[Tensor, " C"],
+    turns: Float[Tensor, " C"],
+) -> tuple[str, ...]:
+    """Return notes on cameras that are wrong in a frame of a live stream.
+
+    Args:
+        cameras: their names. still: for how many frames their keypoints have been those of the frame before.
+        off: which are left out. turns: radians by which keypoints are turned.
+    """
+    notes = [
+        f"the keypoints of camera {cameras[c]} have been exactly the same for {int(still[c]) + 1} frames, "
+        "and are not used; check whether its video stands still"
+        for c in (still >= _GAP - 1).nonzero().flatten().tolist()
+    ]
+    notes += [
+        f"camera {cameras[c]} is left out, since it does not see what the others see"
+        for c in off.nonzero().flatten().tolist()
+    ]
+    degrees = torch.rad2deg(turns)
+    said = [
+        f"camera {cameras[c]} (by {float(degrees[c]):.1f} degrees)"
+        for c in (degrees > _LEAST_TURN).nonzero().flatten().tolist()
+    ]
+    return (*notes, _turned_back(said, "are")) if said else tuple(notes)
+
+
+def _turned_back(said: Sequence[str], verb: str) -> str:
+    """Return a note on cameras whose keypoints were, or are, turned back."""
     return (
         f"against the calibration {' and '.join(said)} seem{'s' * (len(said) == 1)} to be turned; keypoints "
-        "were turned back, but where the person stands in the room may be wrong; "
-        'refine="extrinsics" (--refine extrinsics) gives corrected cameras',
+        f"{verb} turned back, but where the person stands in the room may be wrong; "
+        'refine="extrinsics" (--refine extrinsics) gives corrected cameras'
     )
 
 
