@@ -170,10 +170,22 @@ def test_a_camera_that_stands_still_is_not_used(three):
     torch.testing.assert_close(live.joints3d[0], found.joints3d[11])
 
 
+def test_what_is_refined_leaves_wrong_cameras_out():
+    seen = scene(4, n_frames=14)
+    keypoints = seen.keypoints.clone()
+    keypoints[4:, 2] = keypoints[4, 2]
+    keypoints[:, 3] = 400.0 + 0.5 * seen.keypoints[:, 1].flip(1)
+    tracker = BodyTracker(seen.rig, "kalman", fps=FPS)
+    found = tracker(keypoints=keypoints, names=NAMES, refine="extrinsics")
+    assert float(found.details["inlier"][5:, 2].max()) == 0.0
+    assert float(found.details["inlier"][:, 3].max()) == 0.0
+    assert float(errors(found, seen.joints).mean()) < 0.02
+    assert any("camera c3 was left out" in note for note in found.notes)
+
+
 def test_everything_that_stands_still_is_used(three):
     frame = frame_of(three.keypoints[0])
-    faults = CameraFaults.none(frame)._replace(pixels=frame.pixels, inlier=frame.inlier)
-    assert bool((without_still(frame, faults).inlier > 0).all())
+    assert bool((without_still(frame, frame.pixels, frame.inlier).inlier > 0).all())
 
 
 def test_a_camera_that_sees_somebody_else_is_left_out_and_comes_back():

@@ -106,19 +106,31 @@ def noted(faults: CameraFaults, frame: KeypointFrame, used: KeypointFrame) -> Ca
     return faults._replace(pixels=frame.pixels, inlier=frame.inlier, still=still)
 
 
-def without_still(frame: KeypointFrame, faults: CameraFaults) -> KeypointFrame:
+def without_still(
+    frame: KeypointFrame, pixels: Float[Tensor, "B C J 2"], inlier: Float[Tensor, "B C J"]
+) -> KeypointFrame:
     """Return keypoints without those of cameras whose image is that of the frame before.
 
     All keypoints of such a camera are the same to the last digit, while most of another camera's are not.
+
+    Args:
+        frame: the keypoints. pixels, inlier: of the frame before.
     """
-    moved = (frame.pixels != faults.pixels).any(-1)
+    moved = (frame.pixels != pixels).any(-1)
     if bool(moved.any(-1).all()):
         return frame
-    both = (frame.inlier > 0) & (faults.inlier > 0)
+    both = (frame.inlier > 0) & (inlier > 0)
     count, n_moved = both.sum(-1), (moved & both).sum(-1)
     most_moved = (2 * n_moved > count) & (count >= LEAST_JOINTS)
     still = ~moved.any(-1) & (count >= LEAST_JOINTS) & most_moved.any(-1, keepdim=True)
     return frame._replace(inlier=frame.inlier.masked_fill(still[..., None], 0.0))
+
+
+def without_still_frames(frames: KeypointFrame) -> KeypointFrame:
+    """Return keypoints [T, C, J] without those of cameras whose image is that of the frame before."""
+    later, before = frames.map(lambda value: value[1:]), frames.map(lambda value: value[:-1])
+    used = without_still(later, before.pixels, before.inlier)
+    return frames._replace(inlier=torch.cat([frames.inlier[:1], used.inlier]))
 
 
 class _Explanations(NamedTuple):

@@ -42,6 +42,7 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     refine_cameras,
 )
 from torchpose.whole_body._keypoints.camera_units import check_units
+from torchpose.whole_body._keypoints.faulty_cameras import LEAST_CAMERAS, without_still_frames
 from torchpose.whole_body._keypoints.foot_filter import FootFilter, FootGaussian, FootPoses
 from torchpose.whole_body._keypoints.foot_tracker import step_feet, track_feet
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
@@ -276,7 +277,8 @@ class KeypointBodyTracker(nn.Module):
             moved = moved.map(lambda value: value[None])
             return tracker(moved, smooth, progress, waited=math.inf, watch=False)
 
-        single = frames.map(lambda value: value[0])
+        used, said = self._of_right_cameras(frames, first_frame)
+        single = used.map(lambda value: value[0])
         found = refine_cameras(
             self.rig, single, track, self.fps, refine, former.exchange, smoothing
         )
@@ -286,9 +288,27 @@ class KeypointBodyTracker(nn.Module):
             found.poses, moved, 0, refined=found, first_frame=first_frame, feet=standing
         )
         late = late_note(result.first_frame, TOO_FEW)
-        notes = (*notes_on_refined(self.rig.names, found, refine), *result.notes, *late)
+        notes = (*notes_on_refined(self.rig.names, found, refine), *said, *result.notes, *late)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})
+
+    def _of_right_cameras(
+        self, frames: KeypointFrame, first_frame: int
+    ) -> tuple[KeypointFrame, tuple[str, ...]]:
+        """Return keypoints [1, T, C, J] of cameras that see the person, and notes on those of others.
+
+        Small errors of cameras are estimated from all keypoints, so a video that stands still, or of
+        something else, would move the cameras that are right.
+        """
+        single = frames.map(lambda value: value[0])
+        there, names = single.inlier > 0, self.rig.names
+        said = notes_on_still_cameras(names, single.pixels, there, first_frame)
+        used = without_still_frames(single).map(lambda value: value[None])
+        if len(self.rig) >= LEAST_CAMERAS:
+            off = self.tracker(frames, waited=math.inf).off
+            used = used._replace(inlier=used.inlier.masked_fill(off[..., None], 0.0))
+            said += notes_on_left_out_cameras(names, off[0], first_frame)
+        return used, said
 
     def _refined_feet(
         self, feet: KeypointFrame | None, found: RefinedCameras, smoothing: bool

@@ -145,7 +145,7 @@ class KeypointTracker(nn.Module):
             step = self._advanced(stream, frame, predicted, waited)
             return self._with_lone_cameras(stream, frame, step)
         faults = CameraFaults.none(frame) if stream is None else stream.faults
-        given = without_still(frame, faults)
+        given = without_still(frame, faults.pixels, faults.inlier)
         if stream is not None:
             faults = looked_at_again(self.filter, faults, given)
             stream = stream._replace(faults=faults)
