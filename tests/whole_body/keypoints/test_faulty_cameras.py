@@ -30,7 +30,12 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_a_rolled_camera,
     notes_on_cameras_now,
 )
-from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, turned
+from torchpose.whole_body._keypoints.turned_cameras import (
+    angles_of,
+    find_turns,
+    turned,
+    unlikely,
+)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +107,7 @@ def test_turns_become_better_known_with_more_frames(three):
     for frame in frames[1:]:
         faults = looked_at_again(filter, faults, frame)
         errors.append(angles_of(faults.turn[0] @ true.mT).mean())
-    assert float(faults.looks.count[0]) == 5.0
+    assert float(faults.looks.n_frames[0]) == 5.0
     assert float(errors[-1]) < 0.6 * float(errors[0])
 
 
@@ -112,6 +117,13 @@ def test_what_is_known_of_turns_outlasts_another_search(three):
     again, _, better = find_faults(filter, frames[1], faults)
     assert not bool(better.any())
     assert torch.equal(again.turn, faults.turn) and bool(again.doubted < 0)
+
+
+def test_large_turns_are_unlikely():
+    turn = torch.eye(3).double().repeat(3, 1, 1)
+    assert float(unlikely(turn)) == 0.0
+    turn[1] = rotvec_to_matrix(torch.tensor([0.02, 0.0, 0.0]).double())
+    assert float(unlikely(turn)) == pytest.approx(2 * math.log(2), abs=1e-3)
 
 
 def test_cameras_that_turn_out_to_be_right_are_no_longer_turned_back(three):

@@ -31,7 +31,13 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, free_turns, looked_again
-from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns, is_turned, turned
+from torchpose.whole_body._keypoints.turned_cameras import (
+    angles_of,
+    find_turns,
+    is_turned,
+    turned,
+    unlikely,
+)
 
 LEAST_CAMERAS = 3
 LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
@@ -160,7 +166,7 @@ def find_faults(
         begun: who has just begun with these, if all have.
     """
     known = start(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
-    least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) + _LEAST_GAIN
+    least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) - unlikely(faults.turn)
     tried = _explanations(frame, filter.maps)
     count, n = tried.price.shape
     every = torch.arange(count, device=tried.price.device)
@@ -173,9 +179,9 @@ def find_faults(
     refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
     evidence = torch.where(refused.any(-1) & wrong, -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
-    better = evidence.amax(-1) > least
+    better = evidence.amax(-1) > least + _LEAST_GAIN
     looks = TurnLooks.begun(frame, tried.turn[:, : tried.n_turns])
-    looks = looks._replace(count=is_turned(turn[best]).any(-1).to(looks.count))
+    looks = looks._replace(n_frames=is_turned(turn[best]).any(-1).to(looks.n_frames))
     pause = torch.full_like(faults.doubted, -_PAUSE * filter.fps)
     new = faults._replace(
         turn=turn[best],
@@ -227,13 +233,13 @@ def looked_at_again(
     Args:
         filter: that tracks. faults: that are known. frame: the keypoints.
     """
-    if not bool((faults.looks.count > 0).any()):
+    if not bool((faults.looks.n_frames > 0).any()):
         return faults
     enough = _enough(frame).sum(-1) >= LEAST_CAMERAS
     looks, rows, best = looked_again(faults.looks, frame, enough, filter.maps, filter.fps)
     turn = faults.turn.index_copy(0, rows, best)
     wrong = (faults.off | is_turned(turn)).any(-1)
-    looks = looks._replace(count=torch.where(wrong, looks.count, 0.0))
+    looks = looks._replace(n_frames=torch.where(wrong, looks.n_frames, 0.0))
     return faults._replace(turn=turn, wrong=wrong, looks=looks)
 
 

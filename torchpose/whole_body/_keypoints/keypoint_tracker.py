@@ -242,7 +242,7 @@ class KeypointTracker(nn.Module):
         faults = noted(stream.faults, frame, given)
         if right.inlier.shape[1] >= LEAST_CAMERAS:
             several = stream.begun & (stream.alone < 0)
-            fresh = pose.started & (faults.looks.count == 0)
+            fresh = pose.started & (faults.looks.n_frames == 0)
             faults, due = watched(self.filter, faults, found, right, several, fresh)
             if bool(faults.off.any()):
                 faults = with_returned(self.filter, faults, found, given)

@@ -17,6 +17,8 @@ from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.turned_cameras import find_turns
 
 _FRAMES = 16  # that are kept
+# Log-odds of all cameras turned, which one that is turned by more explains nearly as well.
+_RATHER_ALL = 4.0
 _GAP = 0.05  # seconds from the first frame to the second; each next gap is longer by as much
 
 
@@ -25,12 +27,12 @@ class TurnLooks(NamedTuple):
 
     Attributes:
         frames: keypoints [B, K, C, J], those that are not there yet without trust.
-        count: [B], how many there are, 0 where no camera is turned. age: [B], frames since the first.
+        n_frames: [B], how many there are, 0 where no camera is turned. age: [B], frames since the first.
         turn: [B, H, C, 3, 3], by each of the explanations of `free_turns`.
     """
 
     frames: KeypointFrame
-    count: Tensor
+    n_frames: Tensor
     age: Tensor
     turn: Tensor
 
@@ -49,9 +51,9 @@ class TurnLooks(NamedTuple):
     def begun(cls, frame: KeypointFrame, turn: Float[Tensor, "B H C 3 3"]) -> Self:
         """Return looks with a first frame, and the turns that it tells."""
         first = cls.none(frame)
-        place = first.count.long()
+        place = first.n_frames.long()
         frames = mapped(lambda kept, new: _with_frame(kept, new, place), first.frames, frame)
-        return cls(frames, torch.ones_like(first.count), first.age, turn)
+        return cls(frames, torch.ones_like(first.n_frames), first.age, turn)
 
 
 def free_turns(n_cameras: int, device: torch.device) -> Bool[Tensor, "H C"]:
@@ -69,9 +71,9 @@ def looked_again(
         looks: of the frame before. frame: the keypoints. enough: whose keypoints tell turns.
         maps: the cameras. fps: frames per second.
     """
-    age = looks.age + (looks.count > 0)
-    due = age >= _GAP * fps * looks.count * (looks.count + 1) / 2
-    due = due & enough & (looks.count > 0) & (looks.count < _FRAMES)
+    age = looks.age + (looks.n_frames > 0)
+    due = age >= _GAP * fps * looks.n_frames * (looks.n_frames + 1) / 2
+    due = due & enough & (looks.n_frames > 0) & (looks.n_frames < _FRAMES)
     looks, rows = looks._replace(age=age), due.nonzero().squeeze(-1)
     if not len(rows):
         return looks, rows, looks.turn[rows, 0]
@@ -83,7 +85,7 @@ def _estimated(
     looks: TurnLooks, frame: KeypointFrame, maps: RigMaps
 ) -> tuple[TurnLooks, Float[Tensor, "B C 3 3"]]:
     """Return looks with one more frame, and the turns by the likeliest explanation of all its frames."""
-    place = looks.count.long()
+    place = looks.n_frames.long()
     frames = mapped(lambda kept, new: _with_frame(kept, new, place), looks.frames, frame)
     used = int(place.amax()) + 1
     n, n_cameras = frame.inlier.shape[:2]
@@ -94,9 +96,10 @@ def _estimated(
         side_by_side.take(rows.repeat_interleave(len(free))), free.repeat(n, 1), maps,
         looks.turn.flatten(0, 1),
     )  # fmt: skip
-    best = (found.misfit + found.price).view(n, -1).argmin(-1)
+    cost = (found.misfit + found.price).view(n, -1) - _RATHER_ALL * free.all(-1).to(found.price)
+    best = cost.argmin(-1)
     turn = found.matrix.view_as(looks.turn)
-    return TurnLooks(frames, looks.count + 1, looks.age, turn), turn[rows, best]
+    return TurnLooks(frames, looks.n_frames + 1, looks.age, turn), turn[rows, best]
 
 
 def _with_frame(kept: Tensor, new: Tensor, place: Tensor) -> Tensor:

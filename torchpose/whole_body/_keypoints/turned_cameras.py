@@ -30,9 +30,6 @@ _TURN = 0.02  # radians, the scale s of turns before they are estimated
 _FREEDOM = 4.0  # nu, of Student's distribution of the errors
 _WIDTHS = (400.0, 400.0, 100.0, 100.0, 25.0, 25.0, 9.0, 4.0, 2.0, *[1.0] * 6)
 _WIDTHS_OF_KNOWN = (9.0, 4.0, 1.0, 1.0)
-_RATHER_ALL = (
-    4.0  # log-odds of all cameras turned, which one that is turned by more explains nearly as well
-)
 _KNOWN = 1e12  # per square radian, the information about cameras that are not turned
 _JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cameras do
 
@@ -41,9 +38,8 @@ class Turns(NamedTuple):
     """Holds turns [N, C, 3, 3] of cameras in world axes, and what each choice of free turns costs [N].
 
     `price` is what free turns take from the log-evidence, about Laplace's approximation:
-    2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2, with S the information about the turns. All cameras together
-    cost less by a constant: where all are turned, one that is said to be puts the body far away, while the
-    reverse costs little. `misfit` is what the errors of keypoints take from the log-evidence.
+    2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2, with S the information about the turns. `misfit` is what the
+    errors of keypoints take from it.
     """
 
     matrix: Tensor
@@ -73,6 +69,20 @@ def angles_of(turn: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     return cosine.clamp(-1, 1).arccos()
 
 
+def unlikely(turn: Float[Tensor, "*batch C 3 3"]) -> Float[Tensor, "*batch"]:
+    """Return minus the log density of turns by their prior, sum 2 log(1 + |w|^2 / s^2)."""
+    return _unlikely(_rotvec(turn)).sum(-1)
+
+
+def _unlikely(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    return 2 * torch.log1p(rotvec.square().sum(-1) / _TURN**2)
+
+
+def _rotvec(turn: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return axes times angles, to within 1 % up to half a radian."""
+    return 2 * matrix_to_quaternion_vector(turn)
+
+
 def find_turns(
     frame: KeypointFrame,
     free: Bool[Tensor, "N C"],
@@ -97,7 +107,7 @@ def find_turns(
     else:
         turn, widths = known, _WIDTHS_OF_KNOWN
         joints = triangulate_all(maps, turned(frame, turn, maps), frame.inlier > 0)
-    rotvec = 2 * matrix_to_quaternion_vector(turn)  # nearly: turns are small
+    rotvec = _rotvec(turn)
     for width in widths:
         large = 1 + rotvec.square().sum(-1) / _TURN**2
         prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
@@ -110,8 +120,7 @@ def find_turns(
         turn = rotvec_to_matrix(step.view_as(rotvec)) @ turn
     known_before = 1.5 * torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN))
     narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - known_before.sum(-1)
-    spent = 2 * torch.where(free, 1 + rotvec.square().sum(-1) / _TURN**2, 1.0).log().sum(-1)
-    spent = spent - _RATHER_ALL * free.all(-1).to(spent)
+    spent = torch.where(free, _unlikely(rotvec), 0.0).sum(-1)
     misfit = _equations(frame, rays @ turn.mT, joints, maps, 1.0)[-1]
     return Turns(torch.where(free[..., None, None], turn, eye), spent + narrowed, misfit)
 
