@@ -14,11 +14,14 @@ from torch import Tensor
 
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.nested import mapped, taken
-from torchpose.whole_body._keypoints.turned_cameras import find_turns
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns
 
 _FRAMES = 16  # that are kept
 # Log-odds of all cameras turned, which one that is turned by more explains nearly as well.
 _RATHER_ALL = 4.0
+# What a camera that is turned by much has besides, such as a cropped image, is not to turn the others.
+_FAR = 0.1  # radians from which that is so
+_MORE = 0.02  # share of what it explains that all have to explain on top
 _GAP = 0.05  # seconds from the first frame to the second; each next gap is longer by as much
 
 
@@ -96,10 +99,22 @@ def _estimated(
         side_by_side.take(rows.repeat_interleave(len(free))), free.repeat(n, 1), maps,
         looks.turn.flatten(0, 1),
     )  # fmt: skip
-    cost = (found.misfit + found.price).view(n, -1) - _RATHER_ALL * free.all(-1).to(found.price)
-    best = cost.argmin(-1)
     turn = found.matrix.view_as(looks.turn)
+    best = _likeliest((found.misfit + found.price).view(n, -1), angles_of(turn))
     return TurnLooks(frames, looks.n_frames + 1, looks.age, turn), turn[rows, best]
+
+
+def _likeliest(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Int[Tensor, " B"]:
+    """Return the likeliest explanations.
+
+    Args:
+        cost: minus the log-evidence of each. angles: of its turns, radians.
+    """
+    alone, whose = cost[:, :-2].min(-1)
+    far = angles.amax(-1).gather(1, whose[:, None]).squeeze(-1) > _FAR
+    handicap = torch.where(far, _MORE * (cost[:, -1] - alone), -_RATHER_ALL)
+    all_cameras = cost[:, -2] + handicap
+    return torch.cat([cost[:, :-2], all_cameras[:, None], cost[:, -1:]], -1).argmin(-1)
 
 
 def _with_frame(kept: Tensor, new: Tensor, place: Tensor) -> Tensor:
