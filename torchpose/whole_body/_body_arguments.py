@@ -22,15 +22,6 @@ def refuse(unused: Collection[str], where: str) -> None:
         raise InputError(f"{', '.join(unused)} does nothing {where}; leave it out")
 
 
-def check_tensors(**values: object) -> None:
-    """Raise `InputError` for arrays and lists in place of tensors."""
-    for name, value in given_of(values).items():
-        if not isinstance(value, Tensor):
-            raise InputError(
-                f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
-            )
-
-
 def keypoints_alone(method: str, silhouettes: Any, keypoints: Any) -> Any:
     """Return keypoints; raise `InputError` for silhouettes, and without keypoints."""
     if silhouettes is not None:

@@ -31,7 +31,6 @@ from torchpose.whole_body._body_arguments import (
     check_facing,
     check_filters_one,
     check_not_refined,
-    check_tensors,
     given_of,
     keypoints_alone,
     refuse,
