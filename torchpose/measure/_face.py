@@ -17,10 +17,7 @@ from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
 from torchpose.measure._brightness import brightened, gain_to, quantile_of_bytes
 
-_NEAR, _FARTHER = (
-    0.8,
-    1.1,
-)  # half the sides of the regions searched about a known face, in its sizes
+_ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
 _USUAL = 40.0  # size above which faces are searched for first, pixels
@@ -84,9 +81,7 @@ def _frontal_faces() -> Any:
 class HaarFaceDetector:
     """Detects frontal faces by the cascade of Viola & Jones that comes with OpenCV.
 
-    In a region with faces below 26 pixels it enlarges the image, and asks for more boxes that agree. In one
-    with larger faces, as about a known face, it tries half as many sizes, and half as many boxes have to
-    agree.
+    In a region with faces below 26 pixels it enlarges the image, and asks for more boxes that agree.
     Dark images are made brighter: the cascade takes windows of little contrast for plain walls.
 
     Args:
@@ -130,8 +125,7 @@ class HaarFaceDetector:
             return torch.zeros(0, 3, dtype=torch.float64)
         scale = max(1.0, _CLEAR / max(region.smallest, 1.0))
         if scale == 1:
-            half = (self.min_neighbours + 1) // 2
-            found = self._detect(part, smallest, largest, half, coarse=True)
+            found = self._detect(part, smallest, largest, self.min_neighbours)
         else:
             sizes = (round(smallest * scale), round(largest * scale))
             strict = self.min_neighbours + _STRICTER
@@ -139,12 +133,11 @@ class HaarFaceDetector:
         return found + found.new_tensor([region.left, region.top, 0])
 
     def _detect(
-        self, image: Image, smallest: int, largest: int, neighbours: int, coarse: bool = False
+        self, image: Image, smallest: int, largest: int, neighbours: int
     ) -> Float[Tensor, "N 3"]:
-        """Return the faces between two sizes; `coarse` tries half as many."""
-        factor = self.scale_factor**2 if coarse else self.scale_factor
+        """Return the faces between two sizes."""
         boxes = self._cascade.detectMultiScale(
-            np.ascontiguousarray(_brightened(image)), factor, neighbours,
+            np.ascontiguousarray(_brightened(image)), self.scale_factor, neighbours,
             minSize=(smallest,) * 2, maxSize=(max(smallest, largest),) * 2,
         )  # fmt: skip
         found = torch.from_numpy(np.asarray(boxes, dtype=np.float64).reshape(-1, 4))
@@ -326,20 +319,8 @@ class FaceTracker(nn.Module):
         return self.detector(image, Region(0, 0, width, height, self.smallest, _USUAL))
 
     def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:
-        """Return the detections about a known face: farther from it and tilted if there are none near."""
-        found = self._look_about(image, face, _NEAR, ())
-        return found if len(found) else self._look_about(image, face, _FARTHER, (-_TILT, _TILT))
-
-    def _look_about(
-        self, image: Image, face: list[float], reach: float, turns: tuple[float, ...]
-    ) -> Float[Tensor, "N 3"]:
-        """Return the detections about a known face, scaled to the size `detail`, else in turned images.
-
-        Args:
-            face: (x, y, size). reach: half the side of the region, in sizes of the face.
-            turns: of the image, degrees, until a face is found.
-        """
-        region = _region(face, image.shape, reach)
+        """Return the detections about a known face, scaled to the size `detail`, tilted if not upright."""
+        region = _region(face, image.shape)
         part = image[region.top : region.bottom, region.left : region.right]
         scale = self.detail / max(face[2], 1.0)
         if round(scale * min(part.shape)) < 1:  # the face is outside, or all but outside
@@ -350,7 +331,7 @@ class FaceTracker(nn.Module):
         else:
             part = _resized(part, scale)
             found = self.detector(part, _whole(part, region, scale))
-        for turn in turns:
+        for turn in (-_TILT, _TILT):
             if not len(found):
                 found = _turned_search(self.detector, part, _whole(part, region, scale), turn)
         return scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
@@ -431,12 +412,12 @@ def _turned_search(
     return torch.cat([centres, found[:, 2:]], 1)[inside]
 
 
-def _region(face: list[float], shape: tuple[int, ...], reach: float) -> Region:
+def _region(face: list[float], shape: tuple[int, ...]) -> Region:
     """Return the part of the image about a face, empty if the face is outside, and sizes near its own."""
     size = max(face[2], 1.0)
-    sides = (-reach * size, reach * size)
-    left, right = (min(max(0, int(face[0] + side)), shape[1]) for side in sides)
-    top, bottom = (min(max(0, int(face[1] + side)), shape[0]) for side in sides)
+    reach = _ROI * size
+    left, right = (min(max(0, int(face[0] + side)), shape[1]) for side in (-reach, reach))
+    top, bottom = (min(max(0, int(face[1] + side)), shape[0]) for side in (-reach, reach))
     return Region(left, top, right, bottom, _SMALLER * size, _LARGER * size)
 
 
