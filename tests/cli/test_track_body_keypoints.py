@@ -1,8 +1,10 @@
 """`torchpose track-body` on keypoints: every kind of input, what is written, and what is refused."""
 
 import json
+import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -154,7 +156,7 @@ def test_poses_from_all_kinds_of_files(track, scene, tmp_path):
                      "report.html"}  # fmt: skip
     poses = BodyTrack.load(out / "body.npz")
     assert (len(poses), poses.fps, poses.method) == (N, FPS, "kalman")
-    assert apart(poses, scene[1]) < 0.03
+    assert apart(poses, scene[1]) < 0.03 and "camera_turn" not in poses.details
     rows = (out / "joints.csv").read_text().splitlines()
     assert len(rows) == N + 1
     assert rows[0].startswith("frame,pelvis_x,pelvis_y,pelvis_z,pelvis_std,")
@@ -241,6 +243,33 @@ def test_the_body_is_drawn_into_videos(track, scene, tmp_path):
         assert (tmp_path / name).stat().st_size > 1000
     assert "frame rate" not in done.out  # that of the other inputs
     assert "video ends" not in done.out
+
+
+def test_the_body_is_drawn_as_a_turned_camera_sees_it(torchpose, scene, tmp_path, monkeypatch):
+    folder = scene[0]
+    cameras = list(load_cameras(folder / "cameras.toml").values())
+    turn = torch.from_numpy(cv2.Rodrigues(np.array([0.0, math.radians(3.0), 0.0]))[0])
+    in_world = cameras[1].rotation_matrix.mT @ turn @ cameras[1].rotation_matrix
+    rotation, _ = cv2.Rodrigues((turn @ cameras[1].rotation_matrix).numpy())
+    cameras[1].rotation.copy_(torch.from_numpy(rotation.ravel()))
+    cameras[1].translation.copy_(turn @ cameras[1].translation)
+    save_cameras(cameras, tmp_path / "cameras.toml")
+    off = []
+
+    def measured(image, joints, skeleton, keypoints, **_):
+        off.append((joints - keypoints).norm(dim=-1))
+        return image
+
+    monkeypatch.setattr("torchpose.video._overlay.draw_body", measured)
+    inputs = (folder / name for name in ("front.npz", "left.csv", "behind.npz"))
+    videos = (folder / f"{name}.mp4" for name in PLACES)
+    done = torchpose("track-body", tmp_path / "cameras.toml", *inputs, "--videos", *videos,
+                     "--out", tmp_path / "out", "--overlay", "false")  # fmt: skip
+    assert done.code == 0 and "camera left (by " in done.out, done.err + done.out
+    assert float(torch.stack(off).max()) < 3  # pixels; by its calibration it is off by 8
+    turns = BodyTrack.load(tmp_path / "out" / "body.npz").details["camera_turn"]
+    assert turns.shape == (N, 3, 3, 3)
+    torch.testing.assert_close(turns[-1, 1].double(), in_world, atol=0.01, rtol=0)
 
 
 def test_a_video_that_ends_before_the_keypoints_is_said(track, tmp_path):

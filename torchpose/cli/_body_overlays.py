@@ -138,6 +138,18 @@ def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
     return torch.where((points[:, 2:] > 0) & (off < _FOLDED), pixels, torch.nan)
 
 
+def as_seen(points: "Tensor", camera: "PinholeCamera", turn: "Tensor") -> "Tensor":
+    """Return the points c + turn^T (points - c), which a camera would see where it sees the given ones.
+
+    A turned camera has the rotation R turn^T about its centre c, in place of the R of its calibration.
+
+    Args:
+        points: [J, 3], world axes. camera: as it was calibrated. turn: [3, 3], of `BodyTrack.details`.
+    """
+    centre = -camera.rotation_matrix.mT @ camera.translation
+    return centre + (points.detach().cpu().double() - centre) @ turn.cpu().double()
+
+
 class Films:
     """The videos that bodies are drawn into; a context manager, which closes them.
 
@@ -219,12 +231,21 @@ class Films:
         at = int((t - poses.first_frame - delays[c].round().long()).clamp(0, len(poses) - 1))
         feet = None
         if poses.feet is not None:
-            feet = project_joints(poses.feet.points3d[at], self._cameras[c])
+            feet = self._projected(poses.feet.points3d[at], poses, at, c)
         return draw_body(
-            image, project_joints(poses.joints3d[at], self._cameras[c]), poses.body.skeleton,
+            image, self._projected(poses.joints3d[at], poses, at, c), poses.body.skeleton,
             keypoints=self._seen(t, c) if crosses else None,
             label="" if tint is None else f"person {tint + 1}", tint=tint, feet=feet,
         )  # fmt: skip
+
+    def _projected(self, points: "Tensor", poses: "BodyTrack", at: int, c: int) -> "Tensor":
+        """Return the pixels of points of a pose in camera c, which is turned as its keypoints say."""
+        from torchpose.whole_body._keypoints.keypoint_body_tracker import CAMERA_TURN
+
+        camera = self._cameras[c]
+        if CAMERA_TURN in poses.details:
+            points = as_seen(points, camera, poses.details[CAMERA_TURN][at, c])
+        return project_joints(points, camera)
 
     def _open(self, i: int) -> "VideoSource":
         from torchpose.video._source import open_video

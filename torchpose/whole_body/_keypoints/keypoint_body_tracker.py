@@ -68,7 +68,7 @@ from torchpose.whole_body._keypoints.known_person import (
 )
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
-from torchpose.whole_body._keypoints.turned_cameras import angles_of
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
 T = TypeVar("T")
 KEYPOINT_METHOD = "kalman"
@@ -80,6 +80,8 @@ PIXEL_STD = 1.0
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
+CAMERA_TURN = "camera_turn"
+"""Name of the detail of cameras that are turned, there where any is."""
 COVARIANCE_FROM_PELVIS = "covariance_from_pelvis"
 """Name of the detail of one camera."""
 _HIGHEST_CAMERA = 30.0  # metres above the floor
@@ -453,6 +455,8 @@ class KeypointBodyTracker(nn.Module):
         if feet is not None:
             own = mapped(lambda value: value[b, begun:], feet)
             standing |= dict(zip(DETAILS_OF_FEET, own, strict=True))
+        if bool(is_turned(poses.turn).any()):
+            standing[CAMERA_TURN] = poses.turn
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
