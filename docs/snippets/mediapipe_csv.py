@@ -24,7 +24,7 @@ points[t, j, 0], points[t, j, 1] = rows["x"] * width, rows["y"] * height
 visible[t, j] = rows["visibility"]
 np.savez(
     "from_mediapipe.npz",
-    keypoints=points, confidence=visible, names=names, fps=fps, image_size=(width, height),
+    keypoints=points, visibility=visible, names=names, fps=fps, image_size=(width, height),
 )  # fmt: skip
 print(read_keypoints("from_mediapipe.npz").names[-4:])
 # > ('head', 'neck', 'hand_left', 'hand_right')

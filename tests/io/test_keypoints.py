@@ -231,6 +231,35 @@ def test_long_rows(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "lines",
+    [
+        ["frame,head_x,head_y,head_visibility,lhand_x,lhand_y", "0,1,2,0.7,5,6", "1,3,4,0,5,6"],
+        ["frame,name,x,y,visibility", "0,head,1,2,0.7", "0,lhand,5,6,1", "1,head,3,4,0", "1,lhand,5,6,1"],
+    ],
+)  # fmt: skip
+def test_visibility_of_tables_is_the_confidence(tmp_path, lines):
+    read = read_keypoints(text(tmp_path, *lines))
+    assert read.names == ("head", "lhand")
+    assert read.confidence is not None
+    assert read.confidence.tolist() == [[0.7, 1], [0, 1]]
+    assert read.measured.tolist() == [[True, True], [False, True]]
+
+
+def test_visibility_of_arrays_is_the_confidence_where_there_is_none(tmp_path):
+    visibility, confidence = np.full((5, 3), 0.4), np.full((5, 3), 0.9)
+    of = {"joints2d": points(), "keypoints": None}
+    for arrays, expected in (
+        ({"visibility": visibility}, 0.4),
+        ({"visibility": visibility, "confidence": confidence}, 0.9),
+        ({**of, "confidence": confidence}, 0.9),
+        ({**of, "visibility": visibility, "confidence": confidence}, 0.4),
+    ):
+        read = read_keypoints(write(tmp_path / "a.npz", **arrays))
+        assert read.confidence is not None
+        assert read.confidence.unique().tolist() == [expected]
+
+
+@pytest.mark.parametrize(
     ("lines", "word"),
     [
         ([""], "empty"),
@@ -238,6 +267,10 @@ def test_long_rows(tmp_path):
         (["frame"], "columns"),
         (["frame,head_x", "0,1"], r"head_y \(absent\)"),
         (["frame,head_x,head_y,colour", "0,1,2,3"], "colour"),
+        (
+            ["frame,a_x,a_y,a_confidence,a_visibility", "0,1,2,3,4"],
+            "delete or rename a_visibility",
+        ),
         (
             ["frame,time,head_x,head_y,a,b,c", "0,1,2,3,4,5,6"],
             "rename time, a, b and 1 more .*# fps",

@@ -93,13 +93,15 @@ def read_keypoints(path: str | Path) -> Keypoints:
     """Read 2D keypoints of one person.
 
     ``.npz``: `keypoints` [T, J, 2] and `names` [J]; optionally `confidence` [T, J], `fps`, `K`
-    [3, 3], `image_size` (width, height) and `neck` (its kind). MediaPipe files with `joints2d` and
-    `visibility` in their place are read alike, and head, neck and hands are appended to the landmarks
-    as priors have them (`torchpose.skeleton._mediapipe_landmarks`).
+    [3, 3], `image_size` (width, height) and `neck` (its kind). `joints2d` may stand for `keypoints`. To
+    MediaPipe's landmarks head, neck and hands are appended as priors have them
+    (`torchpose.skeleton._mediapipe_landmarks`).
 
     ``.csv``: a header ``frame,NAME_x,NAME_y[,NAME_confidence],...`` and a row per frame, or the
     long form ``frame,name,x,y[,confidence]`` with a row per keypoint. Empty cells and absent frames
     are missing. Lines ``# fps = 30`` and ``# image_size = 640,480`` may stand above the header.
+
+    In both, `visibility` is the confidence where there is none.
 
     A folder: OpenPose's ``*_keypoints.json``, one per frame, of BODY_25, BODY_25B, COCO, Halpe, MediaPipe or
     COCO-WholeBody. Of several people, the most confident one is followed; see

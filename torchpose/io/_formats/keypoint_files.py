@@ -20,6 +20,7 @@ from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
 
 _SHOWN = 3  # columns that a message lists
+_TRUST = ("confidence", "visibility")  # names of it; MediaPipe's is the second
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 
 
@@ -42,7 +43,8 @@ def read_npz_keypoints(path: Path) -> RawKeypoints:
     """Read `keypoints` [T, J, 2] and `names` [J], or MediaPipe's, and the other keys of `read_keypoints`."""
     there = npz_keys(path)
     landmarks = "keypoints" not in there and "joints2d" in there
-    points, seen = ("joints2d", "visibility") if landmarks else ("keypoints", "confidence")
+    points, trust = ("joints2d", _TRUST[::-1]) if landmarks else ("keypoints", _TRUST)
+    seen = trust[0] if trust[0] in there else trust[1]
     arrays = read_npz(path, (points, "names"), (seen, "fps", "K", "image_size", "neck"))
     given = {key: numbers(f"{path}: {key}", arrays[key])
              for key in (points, seen, "K", "image_size") if key in arrays}  # fmt: skip
@@ -84,14 +86,17 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
 def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
     column = {name: i for i, name in enumerate(header)}
     names = [h[:-2] for h in header[1:] if h.endswith("_x")]
-    wanted = {"frame"} | {f"{n}_{axis}" for n in names for axis in ("x", "y", "confidence")}
+    trust = _TRUST[0]
+    if not any(f"{n}_{trust}" in column for n in names):
+        trust = _TRUST[1]
+    wanted = {"frame"} | {f"{n}_{axis}" for n in names for axis in ("x", "y", trust)}
     strange = [h for h in header if h not in wanted]
     absent = [f"{n}_y" for n in names if f"{n}_y" not in column]
     if names and strange:
         more = f" and {len(strange) - _SHOWN} more" if len(strange) > _SHOWN else ""
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],...; delete or rename "
-            f"{', '.join(strange[:_SHOWN])}{more} (a visibility or score is NAME_confidence; no time is "
+            f"{', '.join(strange[:_SHOWN])}{more} (a score is NAME_confidence; no time is "
             "read: write # fps = 30 above the header)"
         )
     if not names or absent or len(column) != len(header):
@@ -106,16 +111,16 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     points = np.full((count, len(names), 2), np.nan)
     points[index] = joints
     confidence = None
-    if any(f"{n}_confidence" in column for n in names):
+    if any(f"{n}_{trust}" in column for n in names):
         confidence = np.zeros((count, len(names)))
         for j, name in enumerate(names):
-            given = column.get(f"{name}_confidence")
+            given = column.get(f"{name}_{trust}")
             confidence[index, j] = 1.0 if given is None else table[:, given]
     return RawKeypoints(points, tuple(names), confidence, first_frame=first)
 
 
 def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
-    scored = [h.lower() for h in header[4:]] == ["confidence"]
+    scored = len(header) == 5 and header[4].lower() in _TRUST
     if len(header) != 4 + scored:
         raise FileFormatError(
             f"{path}: expected columns frame,name,x,y[,confidence], got {','.join(header)}"
