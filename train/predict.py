@@ -23,7 +23,14 @@ from torchpose.errors import InputError, OutputError, TorchposeError
 from torchpose.upper_body._keypoint_files import TrackSettings
 from train.predict_claims import Claim, Claims, Run
 from train.predict_recordings import KeypointRecording, find_keypoints, share
-from train.predict_summary import Outcome, check_summary, count_outcomes, write_summary
+from train.predict_summary import (
+    OTHER,
+    Outcome,
+    check_summary,
+    count_outcomes,
+    name_others,
+    write_summary,
+)
 from train.predict_tracking import (
     BatchTracker,
     facts_of,
@@ -63,6 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     print(f"process {rank} of {world}: {count_outcomes(outcomes)}")
     if rank == 0:
+        for line in name_others(outcomes):
+            print(f"train: warning: {line}", file=sys.stderr)
         print(f"summary  {Path(options.out) / SUMMARY}")
     return 0 if all(outcome.good for outcome in outcomes.values()) else 1
 
@@ -129,7 +138,7 @@ def predict(
         progress: whether to show a bar.
 
     Returns:
-        What became of every recording, by name.
+        What became of every recording, by name, and of other files in the folders, by path.
 
     Raises:
         InputError, PriorError, CameraError: settings that suit no recording, no recordings.
@@ -137,7 +146,7 @@ def predict(
     """
     out = check_output_folder(out)
     check_summary(out / SUMMARY)
-    found = find_keypoints(recordings, out)
+    found, others = find_keypoints(recordings, out)
     tracker = BatchTracker(settings or TrackSettings(), _own_device(device))
     claims = Claims(out / CLAIMS, alone=world == 1)
     task = ",".join([*tracker.task.values(), *sorted(recording.name for recording in found)])
@@ -151,6 +160,7 @@ def predict(
             bar.update(1)
 
         _visit(claims, share(found, rank, world), settle)
+    outcomes |= {path: Outcome(path, OTHER, error=fault) for path, fault in others.items()}
     write_summary(out / SUMMARY, outcomes)
     return outcomes
 

@@ -9,13 +9,16 @@ import numpy as np
 
 from torchpose._core.digests import digest_of_files
 from torchpose.errors import InputError
+from train.predict_summary import COLUMNS
 
-__all__ = ["KeypointRecording", "content_of", "find_keypoints", "share"]
+__all__ = ["Found", "KeypointRecording", "content_of", "find_keypoints", "share"]
 
 _SUFFIXES = (".npz", ".csv")
 _POINTS = ("keypoints.npy", "joints2d.npy")
 _RESULTS = ({"joints3d.npy", "covariance3d.npy"}, {"state.npy", "body_frame.npy"})
 _OPENPOSE = "*_keypoints.json"
+_FIRST = "frame"  # column of a table
+_LONGEST = 60  # characters of what a file holds
 
 
 class KeypointRecording(NamedTuple):
@@ -26,14 +29,19 @@ class KeypointRecording(NamedTuple):
     n_frames: int
 
 
-def find_keypoints(
-    paths: Sequence[str | Path], leave_out: str | Path | None = None
-) -> list[KeypointRecording]:
-    """Find recordings of keypoints among files and folders, the longest first.
+class Found(NamedTuple):
+    """Holds recordings, the longest first, and why other files in the folders are none, by their paths."""
 
-    Folders are searched with their subfolders; files of other content, and poses that were tracked
-    before, are passed over there, but those that cannot be opened are listed, so that reading them says
-    what is wrong. A folder of OpenPose's JSON files is one recording.
+    recordings: list[KeypointRecording]
+    others: dict[str, str]
+
+
+def find_keypoints(paths: Sequence[str | Path], leave_out: str | Path | None = None) -> Found:
+    """Find recordings of keypoints among files and folders.
+
+    Folders are searched with their subfolders. Files there of other content are told, but not poses that
+    were tracked before nor files with other suffixes. Those that cannot be opened are recordings, so that
+    reading them says what is wrong. A folder of OpenPose's JSON files is one recording.
 
     Args:
         paths: files and folders. leave_out: a folder that is not searched: that of the results.
@@ -43,10 +51,13 @@ def find_keypoints(
             have one name.
     """
     found: dict[str, Path] = {}
+    others: dict[str, str] = {}
     skipped = None if leave_out is None else Path(leave_out).resolve()
     for given in map(Path, paths):
-        for name, path in _recordings_in(given, skipped):
-            if found.setdefault(name, path).resolve() != path.resolve():
+        for name, path, fault in _candidates_in(given, skipped):
+            if fault:
+                others[str(path)] = fault
+            elif found.setdefault(name, path).resolve() != path.resolve():
                 raise InputError(
                     f"{found[name]} and {path}: both results would be called {name}.npz; rename one, "
                     "or give the folder above both"
@@ -55,9 +66,10 @@ def find_keypoints(
         raise InputError(
             f"expected recordings of 2D keypoints ({', '.join(_SUFFIXES)} or folders of {_OPENPOSE}), "
             f"found none in {', '.join(map(str, paths)) or 'no paths at all'}"
+            + "".join(f"; {path}: {others[path]}" for path in list(others)[:1])
         )
     recordings = [KeypointRecording(name, path, _length(path)) for name, path in found.items()]
-    return sorted(recordings, key=lambda r: (-r.n_frames, r.name))
+    return Found(sorted(recordings, key=lambda r: (-r.n_frames, r.name)), others)
 
 
 def share(
@@ -82,50 +94,64 @@ def content_of(path: Path) -> str:
     return digest_of_files(part for pair in named for part in pair)
 
 
-def _recordings_in(given: Path, leave_out: Path | None) -> Iterable[tuple[str, Path]]:
+def _candidates_in(given: Path, leave_out: Path | None) -> Iterable[tuple[str, Path, str]]:
+    """Find the names of recordings, their paths, and why they are none, which is empty for those that are."""
     if given.is_file():
         if given.suffix.lower() not in _SUFFIXES:
             raise InputError(
                 f"{given}: expected keypoints as {', '.join(_SUFFIXES)} or a folder of {_OPENPOSE}; "
                 "`torchpose track` takes videos"
             )
-        yield given.stem, given
+        yield given.stem, given, ""
         return
     if not given.is_dir():
         raise InputError(f"{given}: no such file or folder")
     if _is_openpose(given):
-        yield given.resolve().name, given
+        yield given.resolve().name, given, ""
         return
     for path in sorted(given.rglob("*")):
         if path.name.startswith(".") or (leave_out and leave_out in path.resolve().parents):
             continue
         relative = path.relative_to(given)
         if path.is_dir() and _is_openpose(path):
-            yield relative.as_posix(), path
-        elif path.is_file() and _may_hold_keypoints(path):
-            yield relative.with_suffix("").as_posix(), path
+            yield relative.as_posix(), path, ""
+        elif path.is_file() and path.suffix.lower() in _SUFFIXES:
+            holds = _holds(path)
+            if not _is_result(holds):
+                yield relative.with_suffix("").as_posix(), path, _fault(path, holds)
 
 
 def _is_openpose(folder: Path) -> bool:
     return next(folder.glob(_OPENPOSE), None) is not None
 
 
-def _may_hold_keypoints(path: Path) -> bool:
-    suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        return False
+def _holds(path: Path) -> tuple[str, ...]:
+    """Return the names of the arrays or columns of a file; those of keypoints if it cannot be opened."""
+    is_npz = path.suffix.lower() == ".npz"
     try:
-        if suffix == ".npz":
+        if is_npz:
             with zipfile.ZipFile(path) as archive:
-                members = set(archive.namelist())
-            tracked = any(result <= members for result in _RESULTS)
-            return not tracked and bool(members.intersection(_POINTS))
+                return tuple(archive.namelist())
         with path.open("rb") as stream:
             lines = stream.read(4096).decode("utf-8-sig", "replace").splitlines()
     except (zipfile.BadZipFile, OSError):
-        return True  # reading it gives the error
-    header = next((line for line in lines if line.strip() and not line.startswith("#")), "frame")
-    return header.split(",")[0].strip().lower() == "frame"
+        return _POINTS if is_npz else (_FIRST,)  # reading it gives the error
+    header = next((line for line in lines if line.strip() and not line.startswith("#")), _FIRST)
+    return tuple(cell.strip() for cell in header.split(","))
+
+
+def _is_result(holds: tuple[str, ...]) -> bool:
+    return holds == COLUMNS or any(result <= set(holds) for result in _RESULTS)
+
+
+def _fault(path: Path, holds: tuple[str, ...]) -> str:
+    """Return why a file that holds these arrays or columns has no keypoints; empty if it may have some."""
+    if path.suffix.lower() == ".npz":
+        expected, there = "an array keypoints or joints2d", not set(holds).isdisjoint(_POINTS)
+    else:
+        expected, there = f"a first column {_FIRST}", holds[0].lower() == _FIRST
+    names = ", ".join(name.removesuffix(".npy") for name in holds)
+    return "" if there else f"expected {expected}, got {names[:_LONGEST] or 'none'}"
 
 
 def _length(path: Path) -> int:

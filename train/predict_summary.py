@@ -11,10 +11,20 @@ from typing import Any, NamedTuple
 from torchpose._core.files import atomic_path
 from torchpose.errors import OutputError
 
-__all__ = ["COLUMNS", "Outcome", "check_summary", "count_outcomes", "write_summary"]
+__all__ = [
+    "COLUMNS",
+    "OTHER",
+    "Outcome",
+    "check_summary",
+    "count_outcomes",
+    "name_others",
+    "write_summary",
+]
 
 COLUMNS = ("recording", "state", "frames", "fps", "seconds", "log_evidence",
            "log_evidence_per_frame", "missing", "failed_at", "took_seconds", "error")  # fmt: skip
+OTHER = "no recording"
+_SHOWN = 5  # files that are none
 _WORDS = {"made": "made", "found": "made before or by others", "failed": "failed"}
 
 
@@ -22,7 +32,8 @@ class Outcome(NamedTuple):
     """The outcome of tracking a recording.
 
     Attributes:
-        recording: its name. state: "made" now, "found" from before, or "failed".
+        recording: its name; of a file that is none its path.
+        state: "made" now, "found" from before, "failed", or "no recording".
         facts: of its result, see `train.predict_tracking.facts_of`. error: why there is none.
     """
 
@@ -39,7 +50,7 @@ class Outcome(NamedTuple):
     def row(self) -> dict[str, Any]:
         """Return its line in the summary, the same whichever process writes it."""
         if self.facts is None:
-            return {"recording": self.recording, "state": "failed", "error": self.error}
+            return {"recording": self.recording, "state": self.state, "error": self.error}
         facts = dict(self.facts)
         facts["log_evidence_per_frame"] = facts["log_evidence"] / facts["frames"]
         numbers = {key: _text(facts[key]) for key in COLUMNS if key in facts}
@@ -91,7 +102,16 @@ def count_outcomes(outcomes: Mapping[str, Outcome]) -> str:
     broken = sum(o.facts is not None and not o.good for o in outcomes.values())
     if broken:
         parts.append(f"in {broken} the filter degenerated (failed_at in the summary)")
-    return f"{len(outcomes)} recordings: {', '.join(parts)}"
+    return f"{len(outcomes) - states[OTHER]} recordings: {', '.join(parts)}"
+
+
+def name_others(outcomes: Mapping[str, Outcome]) -> list[str]:
+    """Say which files are no recordings, the first few of them, and why."""
+    others = [outcomes[name] for name in sorted(outcomes) if outcomes[name].state == OTHER]
+    lines = [f"no recording: {other.recording}: {other.error}" for other in others[:_SHOWN]]
+    if len(others) > _SHOWN:
+        lines.append(f"no recordings: {len(others) - _SHOWN} more files, which the summary lists")
+    return lines
 
 
 def _text(value: Any) -> str:

@@ -54,7 +54,7 @@ def prior_file(tmp_path_factory) -> str:
 
 @pytest.fixture
 def data(tmp_path) -> Path:
-    """Seven recordings of different lengths, one of which is cut short, and what is none."""
+    """Seven recordings of different lengths, one of which is cut short, and files that are none."""
     folder = tmp_path / "data"
     for seed, (name, n_frames) in enumerate(LENGTHS.items()):
         write_recording(folder / f"{name}.npz", n_frames, seed)
@@ -118,8 +118,12 @@ def test_bad_recordings_are_listed_and_do_not_stop_the_others(data, prior_file, 
     np.savez(data / "empty.npz", **gap)
     arguments = [str(data), "--out", str(out), "--track.prior", prior_file]
     assert main(arguments) == 1
-    assert "9 recordings: 7 made, 2 failed" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "9 recordings: 7 made, 2 failed" in said.out
+    other, reason = str(data / "other.npz"), "expected an array keypoints or joints2d, got joints"
+    assert said.err.strip() == f"train: warning: no recording: {other}: {reason}"
     table = rows(out)
+    assert (table[other]["state"], table[other]["error"]) == ("no recording", reason)
     assert list(table) == sorted(table) and tuple(table["a"]) == COLUMNS
     assert {name for name, row in table.items() if row["state"] == "failed"} == {"broken", "empty"}
     assert "broken.npz: expected an .npz file" in table["broken"]["error"]
@@ -217,7 +221,7 @@ def test_the_config_in_the_repository_is_complete() -> None:
 
 
 def test_longest_first_and_each_once_over_any_number_of_processes(data) -> None:
-    found = find_keypoints([data])
+    found = find_keypoints([data]).recordings
     assert [r.name for r in found] == ["b", "sub/e", "sub/d", "a", "f", "c", "broken"]
     assert [r.n_frames for r in found][:3] == [30, 25, 20]
     for world in (1, 2, 3, 9):
@@ -235,7 +239,10 @@ def test_openpose_folders_csv_and_names_that_clash(tmp_path) -> None:
         (folder / f"f{frame}_keypoints.json").write_text("{}")
     (tmp_path / "clips" / "k.csv").write_text("# fps = 30\nframe,head_x,head_y\n0,1,2\n")
     (tmp_path / "clips" / "t.csv").write_text("time,price\n0,1\n")
-    assert [r.name for r in find_keypoints([tmp_path / "clips"])] == ["k", "wave"]
+    found = find_keypoints([tmp_path / "clips"])
+    assert [r.name for r in found.recordings] == ["k", "wave"]
+    table = str(tmp_path / "clips" / "t.csv")
+    assert found.others == {table: "expected a first column frame, got time, price"}
     write_recording(tmp_path / "k.npz", 3)
     with pytest.raises(InputError, match=r"both results would be called k\.npz"):
         find_keypoints([tmp_path / "clips", tmp_path / "k.npz"])
@@ -249,14 +256,34 @@ def test_openpose_folders_csv_and_names_that_clash(tmp_path) -> None:
 def test_results_inside_the_recordings_are_no_recordings(data, prior_file) -> None:
     settings = TrackSettings(prior=prior_file)
     for _ in range(2):
-        assert len(predict([data], data / "out", settings)) == 7
+        outcomes = predict([data], data / "out", settings)
+        assert set(outcomes) == {*LENGTHS, "broken", str(data / "other.npz")}
 
 
 def test_results_of_another_run_are_no_recordings(data, prior_file, tmp_path) -> None:
     settings = TrackSettings(prior=prior_file)
     predict([data / "a.npz"], data / "earlier", settings)
     assert (data / "earlier" / "a.npz").is_file()
-    assert len(find_keypoints([data])) == 7
+    found = find_keypoints([data])
+    assert len(found.recordings) == 7 and list(found.others) == [str(data / "other.npz")]
+
+
+def test_a_folder_with_a_file_that_is_no_recording_is_not_done(data, prior_file, tmp_path, capsys):
+    folder = tmp_path / "two"
+    folder.mkdir()
+    (data / "a.npz").rename(folder / "a.npz")
+    arguments = [str(folder), "--out", str(tmp_path / "out"), "--track.prior", prior_file]
+    assert main(arguments) == 0 and not capsys.readouterr().err
+    for i in range(6):
+        (folder / f"bad{i}.csv").write_text("time,price\n0,1\n")
+    assert main(arguments) == 1
+    said = capsys.readouterr()
+    assert "1 recordings: 1 made before" in said.out
+    assert "bad4.csv: expected a first column frame, got time, price" in said.err
+    assert "no recordings: 1 more files, which the summary lists" in said.err
+    (folder / "a.npz").unlink()
+    assert main(arguments) == 2
+    assert "found none in" in (said := capsys.readouterr().err) and "got time, price" in said
 
 
 def test_ranks_come_from_torchrun_slurm_or_options(monkeypatch) -> None:
@@ -403,7 +430,8 @@ def test_killed_workers_lose_nothing_and_nothing_is_made_twice(data, prior_file,
     assert "sub/e" in twice and twice <= {"sub/e", "c", "f"}  # those that were being made
     table = rows(out)
     assert {name: row["state"] for name, row in table.items()} == {
-        **dict.fromkeys(LENGTHS, "done"), "broken": "failed"
+        **dict.fromkeys(LENGTHS, "done"), "broken": "failed",
+        str(data / "other.npz"): "no recording",
     }  # fmt: skip
     assert all(int(table[name]["frames"]) == n for name, n in LENGTHS.items())
 
@@ -429,7 +457,7 @@ def test_a_live_process_takes_over_from_a_killed_one(data, prior_file, tmp_path)
     assert counts["sub/e"] == {"started": 2, "finished": 1}
     assert all(counts[name]["finished"] == 1 for name in LENGTHS)
     assert read_origin(out / "sub" / "e.npz")["facts"]["frames"] == LENGTHS["sub/e"]
-    assert len(rows(out)) == 7
+    assert len(rows(out)) == 8
 
 
 def _wait_for(flag: Path, process: subprocess.Popen, seconds: float = 120) -> None:
