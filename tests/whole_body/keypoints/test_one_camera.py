@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import torchpose
-from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, ring, scene
-from torchpose.body import BODY_15
+from tests.whole_body.keypoints.scenes import FPS, NAMES, Scene, moving_body, ring, scene
+from torchpose.body import BODY_15, Body
 from torchpose.errors import InputError
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
@@ -22,11 +22,14 @@ from torchpose.whole_body._keypoints.body_size import (
     units_of_size,
 )
 from torchpose.whole_body._keypoints.keypoint_start import _begun
+from torchpose.whole_body._keypoints.only_camera import until_seen
 
 FLOOR = Floor(torch.tensor([0.0, 1.0, 0.0]).double(), torch.tensor([0.0, 1.5, 0.0]).double(), 1.5)
 STD = 0.07
 ANKLES = [BODY_15.joint("left_ankle"), BODY_15.joint("right_ankle")]
 PELVIS = BODY_15.joint("pelvis")
+LEGS = [BODY_15.joint(f"{side}_{name}") for side in ("left", "right") for name in ("knee", "ankle")]
+HIPS = [PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
 
 
 def ankles_at(heights, size=1.0):
@@ -132,6 +135,60 @@ def test_covariances_of_one_camera_do_not_know_the_distance(smoothing):
     assert float((unit @ relative[-1, ANKLES[0]] @ unit).sqrt()) > 0.073 * float(leg.norm())
 
 
+def seated(n_frames):
+    """Somebody who sits still, [T, 15, 3]: thighs lie, shanks hang."""
+    body, right_angle = Body.of_height(BODY_15, 1.7), math.sqrt(0.5)  # of a quaternion's vector
+    state = torch.zeros(n_frames, body.dim, dtype=torch.float64)
+    for side in ("left", "right"):
+        state[:, 3 + 3 * BODY_15.parts.index(f"{side}_thigh")] = -right_angle
+        state[:, 3 + 3 * BODY_15.parts.index(f"{side}_shank")] = right_angle
+        state[:, 3 + 3 * BODY_15.parts.index(f"{side}_forearm")] = -0.6
+    return body.joints(state)
+
+
+def hidden(given, joints, frames=slice(None)):
+    """The scene without keypoints of some joints."""
+    keypoints, confidence = given.keypoints.clone(), given.confidence.clone()
+    keypoints[frames, :, joints], confidence[frames, :, joints] = math.nan, 0.0
+    return given._replace(keypoints=keypoints, confidence=confidence)
+
+
+def squares_from_pelvis(given, track):
+    """Squares of Mahalanobis distances of joints relative to the pelvis, [T, 15], 0 that of the pelvis."""
+    error = track.joints3d - given.joints
+    error = error - error[:, [PELVIS]]
+    covariance = track.details["covariance_from_pelvis"] + 1e-9 * torch.eye(3)
+    return (error * torch.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
+
+
+@pytest.mark.parametrize("smoothing", ["none", "full"])
+def test_ellipsoids_of_legs_behind_a_desk_hold_somebody_who_sits(smoothing):
+    joints, rig = seated(20), ring(1)
+    whole = Scene(joints, rig, rig(joints).pixels, torch.ones(20, 1, 15, dtype=torch.float64))
+    given = hidden(whole, [*HIPS, *LEGS])
+    found = track(given, smoothing, height=1.7)
+    off = (found.joints3d - joints)[:, LEGS].norm(dim=-1)
+    assert float(off.max()) > 0.2  # guessed, as those of somebody who stands
+    assert float(squares_from_pelvis(given, found)[:, LEGS].mean()) < 11.3  # 99 %
+
+
+@pytest.mark.parametrize("smoothing", ["none", "full"])
+def test_covariances_of_legs_grow_while_they_are_hidden(smoothing):
+    given = hidden(scene(1, 25), LEGS, slice(5, 20))
+    found = track(given, smoothing)
+    ankle = found.details["covariance_from_pelvis"][:, ANKLES[0]].diagonal(dim1=-2, dim2=-1)
+    std = ankle.sum(-1).sqrt()
+    last = {"none": 19, "full": 12}[smoothing]  # smoothed, legs that will be seen are known too
+    assert float(std[last]) > 1.2 * float(std[4])
+    assert float(std[20]) < 1.1 * float(std[4])  # a keypoint is enough
+
+
+def test_until_seen_counts_the_frames_to_the_next_keypoint():
+    unseen = torch.tensor([torch.inf, 0.0, 0.1, 0.2, 0.0, 0.1])
+    expected = torch.tensor([1.0, 0.0, 2.0, 1.0, 0.0, torch.inf])
+    torch.testing.assert_close(until_seen(unseen[None, :, None])[0, :, 0], expected)
+
+
 def test_several_cameras_say_nothing_of_the_pelvis():
     assert "covariance_from_pelvis" not in track(scene(2, 3)).details
 
@@ -156,7 +213,7 @@ def test_a_camera_of_known_height_finds_how_large_a_person_is(height):
 
 
 def test_live_steps_find_the_size_of_whole_sequences():
-    given = scene(1, 12)
+    given = hidden(scene(1, 12), LEGS, slice(4, 12))
     tracker = torchpose.BodyTracker(given.rig, "kalman", fps=FPS, up="y", camera_height=1.9)
     whole = tracker(keypoints=given.keypoints, names=NAMES)
     stream = tracker.init()

@@ -22,6 +22,7 @@ class KeypointStream(NamedTuple):
         faults: of the cameras, as each person tells them.
         size: of [B], of the only camera, in which the filter does not tell it.
         spread: [B, J], metres, standard deviations of the network's joints in the last frame that it lifted.
+        unseen: [B, J], seconds since a keypoint was a joint's, infinite where none has been.
     """
 
     state: BodyGaussian
@@ -32,6 +33,7 @@ class KeypointStream(NamedTuple):
     faults: CameraFaults
     size: SizeBelief
     spread: Tensor
+    unseen: Tensor
 
 
 class KeypointPoses(NamedTuple):
@@ -47,7 +49,7 @@ class KeypointPoses(NamedTuple):
         off: [..., C], which cameras counted not.
         scale: [..., C], factors of the cameras' noise. joint_cov: [..., J, 3, 3], without what frames do not
             average out, which `covariance` has on top.
-        size, spread: as of `KeypointStream`; what they tell is in the poses already.
+        size, spread, unseen: as of `KeypointStream`; what they tell is in the poses already.
     """
 
     joints: Tensor
@@ -66,6 +68,7 @@ class KeypointPoses(NamedTuple):
     joint_cov: Tensor
     size: SizeBelief
     spread: Tensor
+    unseen: Tensor
 
 
 KeypointStep = tuple[KeypointStream, KeypointPoses, CorrectedBody]

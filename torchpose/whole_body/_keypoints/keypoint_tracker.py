@@ -169,11 +169,11 @@ class KeypointTracker(nn.Module):
             due, nobody = enough, torch.full_like(enough, NOBODY, dtype=torch.long)
             found = self._started(frame, lifted)
             lost, faults = torch.zeros_like(count), CameraFaults.none(frame)
-            size, spread = (
-                SizeBelief.usual(self.size_std, count),
-                torch.zeros_like(found.state.doubt),
-            )
-            stream = KeypointStream(found.state, enough, lost, nobody, memory, faults, size, spread)
+            size, never = SizeBelief.usual(self.size_std, count), frame.inlier[:, 0]
+            stream = KeypointStream(
+                found.state, enough, lost, nobody, memory, faults, size,
+                torch.zeros_like(never), torch.full_like(never, torch.inf),
+            )  # fmt: skip
         else:
             predicted = self.filter.predict(stream.state) if predicted is None else predicted
             found = self._followed(frame, lifted, predicted)
@@ -190,7 +190,9 @@ class KeypointTracker(nn.Module):
         if lifted is not None:
             spread = torch.where(lifted.std.isfinite(), lifted.std, stream.spread)
             stream = stream._replace(spread=spread)
-        stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
+        seen = (found.weighed.inlier > 0.5).any(-2)
+        unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
+        stream = stream._replace(unseen=unseen, lost=self._lost(stream, frame, found.weighed))
         return stream, self._posed(stream, found, due), found
 
     def _posed(
@@ -203,7 +205,7 @@ class KeypointTracker(nn.Module):
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
             stream.faults.turn, stream.faults.off, found.state.scale, found.joint_cov,
-            stream.size, stream.spread,
+            stream.size, stream.spread, stream.unseen,
         )  # fmt: skip
 
     def first_frames(self, frames: KeypointFrame) -> Int[Tensor, " B"]:

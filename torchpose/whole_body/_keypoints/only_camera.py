@@ -2,10 +2,15 @@
 
 That are the size, since who is larger and farther looks the same (`body_size`), and depths of which the
 network that lifts is unsure. It errs in the same way for long, so frames do not average that out, and each
-joint keeps 1.25 times the network's standard deviation s_j along its ray. With p_j from the place of the
-camera, the ray r_j, and covariances P_j of the filter,
+joint keeps 1.25 times the network's standard deviation s_j along its ray. A joint without a keypoint for
+the time t_j is where the network guesses it again and again, so it comes to keep 2.5 times that deviation in
+all directions. With p_j from the place of the camera, the ray r_j, and covariances P_j of the filter,
 
-    P_j + var(l) p_j p_j^T + (1.25 s_j)^2 r_j r_j^T.
+    P_j + var(l) p_j p_j^T + (1.25 s_j)^2 r_j r_j^T + u_j (2.5 s_j)^2 I,   u_j = 1 - exp(-t_j / (0.5 s)).
+
+The network's deviations are those from the pelvis, which counts as seen where a hip is. Relative to it the
+larger of u_j and u_pelvis is in place of u_j. In the room, an unseen pelvis is as far off as the neck is from
+it, and takes unseen joints along: they have u_j u_pelvis (2.5 s_neck)^2 I on top.
 """
 
 import torch
@@ -29,7 +34,9 @@ from torchpose.whole_body._keypoints.nested import mapped
 # On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
 # strangers to a network that was fitted without them.
 _LASTING = 1.25
-_PELVIS = BODY_15.joint("pelvis")
+_LASTING_UNSEEN, _FORGOTTEN = 2.5, 0.5  # seconds
+_PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
+_MIDDLE = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
 
 
 class OnlyCamera:
@@ -64,7 +71,8 @@ class OnlyCamera:
     def at_last_size(self, poses: KeypointPoses) -> KeypointPoses:
         """Return sequences [B, T] at the sizes that are believed after their last frames."""
         last = mapped(lambda value: value[:, -1:].expand_as(value), poses.size)
-        return self.sized(poses._replace(size=last))
+        unseen = torch.minimum(poses.unseen, until_seen(poses.unseen) / self.filter.fps)
+        return self.sized(poses._replace(size=last, unseen=unseen))
 
     def sized(self, poses: KeypointPoses) -> KeypointPoses:
         """Return poses, as the filter has them, at the sizes that are stated with them."""
@@ -82,20 +90,59 @@ class OnlyCamera:
         lasting = self.lasting_std**2 * torch.eye(3).to(away)
         of_size = variance[..., None] * outer(away)
         along = tangent_of_size(body, poses.point, centre)
+        unsure = self._unsure(poses, _guessed_in_room(poses))
         return poses._replace(
             state_cov=poses.state_cov + variance * outer(along),
-            covariance=poses.joint_cov + lasting + of_size + self._unsure_depth(poses),
+            covariance=poses.joint_cov + lasting + of_size + unsure,
         )
 
     def covariance_from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "*batch J 3 3"]:
         """Return the covariances of joints relative to the pelvis, whose own is zero; metres squared."""
         _, jacobian = self.filter.articulation.linearise(poses.point)
         apart = jacobian - jacobian[..., [_PELVIS], :, :]
-        lasting = self._unsure_depth(poses)
+        lasting = self._unsure(poses, _guessed_from_pelvis(poses))
         lasting[..., _PELVIS, :, :] = 0
         return apart @ poses.state_cov.unsqueeze(-3) @ apart.mT + lasting
 
-    def _unsure_depth(self, poses: KeypointPoses) -> Float[Tensor, "*batch J 3 3"]:
-        """Return the covariances of what the network does not tell of depths."""
+    def _unsure(
+        self, poses: KeypointPoses, variances: Float[Tensor, "*batch J"]
+    ) -> Float[Tensor, "*batch J 3 3"]:
+        """Return the covariances of depths that the network does not tell, and `variances` each way."""
         rays = torch.nn.functional.normalize(poses.joints - self.centre, dim=-1)
-        return (_LASTING * poses.spread).square()[..., None, None] * outer(rays)
+        depth = (_LASTING * poses.spread).square()[..., None, None] * outer(rays)
+        return depth + variances[..., None, None] * torch.eye(3).to(rays)
+
+
+def _guessed_in_room(poses: KeypointPoses) -> Float[Tensor, "*batch J"]:
+    """Return the variances of joints in the room that the network guesses."""
+    share, variances = _shares_and_variances(poses)
+    of_pelvis = share[..., [_PELVIS]] * variances[..., [_NECK]]
+    guessed = share * (variances + of_pelvis)
+    guessed[..., _PELVIS] = of_pelvis[..., 0]
+    return guessed
+
+
+def _guessed_from_pelvis(poses: KeypointPoses) -> Float[Tensor, "*batch J"]:
+    """Return the variances of joints relative to the pelvis if one of both is guessed."""
+    share, variances = _shares_and_variances(poses)
+    return torch.maximum(share, share[..., [_PELVIS]]) * variances
+
+
+def _shares_and_variances(
+    poses: KeypointPoses,
+) -> tuple[Float[Tensor, "*batch J"], Float[Tensor, "*batch J"]]:
+    """Return u_j and (2.5 s_j)^2."""
+    unseen = poses.unseen.clone()
+    unseen[..., _PELVIS] = unseen[..., _MIDDLE].amin(-1)
+    return -torch.expm1(-unseen / _FORGOTTEN), (_LASTING_UNSEEN * poses.spread).square()
+
+
+def until_seen(unseen: Float[Tensor, "B T J"]) -> Float[Tensor, "B T J"]:
+    """Return for how many frames joints will not be seen, infinite where none follows in which they are.
+
+    Args:
+        unseen: how long they have not been.
+    """
+    now = torch.arange(unseen.shape[1]).to(unseen)[:, None]
+    seen = torch.where(unseen == 0, now, torch.inf)
+    return seen.flip(1).cummin(1).values.flip(1) - now
