@@ -100,8 +100,7 @@ def _notes_on_joints_without_keypoints(there: Bool[Tensor, "T C J"]) -> list[str
     joints = ", ".join(name for name, flag in zip(BODY_15.names, never, strict=True) if flag)
     return [
         f"no camera has a keypoint of {joints} in any frame: they are guessed from how the people of the "
-        "prior stand and move, and may be off by much more than their standard deviations if the person "
-        "sits or lies"
+        "prior stand and move, and may be off by half a metre if the person sits or lies"
     ]
 
 
