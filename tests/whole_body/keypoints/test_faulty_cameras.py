@@ -19,6 +19,11 @@ from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_refinement import (
+    _corrected,
+    _one_after_another,
+    _turns_of,
+)
 from torchpose.whole_body._keypoints.faulty_cameras import (
     CameraFaults,
     find_faults,
@@ -193,6 +198,34 @@ def test_what_is_refined_leaves_wrong_cameras_out():
     assert float(found.details["inlier"][:, 3].max()) == 0.0
     assert float(errors(found, seen.joints).mean()) < 0.02
     assert any("camera c3 was left out" in note for note in found.notes)
+    assert not any("no keypoint of this person" in note for note in found.notes)
+
+
+def test_what_is_refined_begins_with_the_turns_that_tracking_finds(three):
+    said = with_turn(three.rig, 1, 6.0)
+    tracker = BodyTracker(said, "kalman", fps=FPS)
+    found = tracker(keypoints=three.keypoints[:14], names=NAMES, refine="extrinsics")
+    assert float(errors(found, three.joints[:14]).mean()) < 0.02
+    rotation = rotvec_to_matrix(found.details["camera_rotation"][0])
+    off = torch.rad2deg(angles_of(rotation @ three.rig.rotation.mT))
+    assert float(off.max()) < 0.8
+    notes = [note for note in found.notes if "refined: camera c1 was turned by" in note]
+    assert len(notes) == 1 and abs(float(notes[0].split("by ")[1].split()[0]) - 6.0) < 0.8
+
+
+def test_turns_that_are_known_and_further_errors_make_one(three):
+    known = torch.zeros(3, 7, dtype=torch.float64)
+    known[1, :3] = torch.tensor([0.1, -0.2, 0.05])
+    further = 0.02 * torch.randn(3, 7, generator=torch.Generator().manual_seed(3)).double()
+    first = _corrected(three.rig, known)
+    both = _corrected(three.rig, _one_after_another(known, further))
+    then = _corrected(first, further)
+    torch.testing.assert_close(both.rotation, then.rotation)
+    torch.testing.assert_close(both.translation, then.translation)
+    change = first.rotation[1] @ three.rig.rotation[1].mT
+    turn = torch.eye(3).double().repeat(3, 1, 1)
+    turn[1] = (three.rig.rotation[1].mT @ change @ three.rig.rotation[1]).mT
+    torch.testing.assert_close(_turns_of(three.rig, turn), known[:, :3])
 
 
 def test_everything_that_stands_still_is_used(three):

@@ -5,6 +5,9 @@ smoothed with the cameras as they are known so far, which gives joints and their
 joints are adjusted to the keypoints together (`camera_bundle`). At the end the body is tracked with the given
 and with the corrected cameras. The corrected ones are kept if they raise the log-evidence of the filter by
 more than they cost.
+
+Where tracking has found one camera that is turned and others that are not, all this begins with it turned,
+and its corrections are about that. From the calibration as given the turn would be spread over all cameras.
 """
 
 import copy
@@ -17,6 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
+from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
 from torchpose.whole_body._keypoints.camera_bundle import (
     N_ERRORS,
     BundleInputs,
@@ -32,6 +36,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
+from torchpose.whole_body._keypoints.turned_cameras import is_turned
 
 REFINED = ("none", "delays", "extrinsics", "both")
 DELAY = N_ERRORS - 1
@@ -77,16 +82,39 @@ def refine_cameras(
     what: str,
     exchange: Exchange,
     smoothing: bool = False,
+    turn: Float[Tensor, "C 3 3"] | None = None,
 ) -> RefinedCameras:
     """Return cameras without the errors that keypoints tell of.
 
-    The first camera keeps the time. No camera keeps its pose: errors of all are as small as they can be.
+    The first camera keeps the time. No camera keeps its pose: errors of all are as small as they can be. If
+    some are turned and others are not, they are as small as they can be beside these turns, which would
+    be spread over all.
 
     Args:
         rig: the cameras, two or more. frames: keypoints [T, C, J]. track: tracks with a rig.
         fps: frames per second. what: "delays", "extrinsics" or "both". exchange: of sides.
-        smoothing: of the poses that are returned.
+        smoothing: of the poses that are returned. turn: of cameras about their centres, in world axes,
+            as tracking has found them.
     """
+    if turn is None or what == "delays" or not _some_are_turned(turn):
+        return _refined(rig, frames, track, fps, what, exchange, smoothing)
+    known = CameraErrors.none(rig).values
+    known[:, :3] = _turns_of(rig, turn)
+    found = _refined(_corrected(rig, known), frames, track, fps, what, exchange, smoothing)
+    errors = found.errors._replace(values=_one_after_another(known, found.errors.values))
+    return found._replace(errors=errors, kept=False)
+
+
+def _refined(
+    rig: CameraRig,
+    frames: KeypointFrame,
+    track: Track,
+    fps: float,
+    what: str,
+    exchange: Exchange,
+    smoothing: bool,
+) -> RefinedCameras:
+    """Return cameras without errors about those of a rig."""
     errors, free = CameraErrors.none(rig), free_errors(len(rig), what)
     before = track(rig, frames, True)
     poses, adjusted = before, None
@@ -172,6 +200,36 @@ def _corrected(rig: CameraRig, values: Float[Tensor, "C 7"]) -> CameraRig:
         **dict(rig.named_buffers()), "rotation": rotation, "translation": translation
     }  # fmt: skip
     return other
+
+
+def _some_are_turned(turn: Float[Tensor, "C 3 3"]) -> bool:
+    """Return whether some cameras are turned, and others are not."""
+    count = int(is_turned(turn).sum())
+    return 0 < count < len(turn)
+
+
+def _turns_of(rig: CameraRig, turn: Float[Tensor, "C 3 3"]) -> Float[Tensor, "C 3"]:
+    """Return the rotations in camera axes that turns of world axes are, of cameras about their centres."""
+    return torch.where(
+        is_turned(turn)[:, None], _rotvec(rig.rotation @ turn.mT @ rig.rotation.mT), 0.0
+    )
+
+
+def _one_after_another(
+    known: Float[Tensor, "C 7"], further: Float[Tensor, "C 7"]
+) -> Float[Tensor, "C 7"]:
+    """Return errors of poses that are turned by those that are known, and then have further ones."""
+    first, then = rotvec_to_matrix(known[:, :3]), rotvec_to_matrix(further[:, :3])
+    turned = known[:, :3].any(-1, keepdim=True)
+    both = torch.where(turned, _rotvec(then @ first), further[:, :3])
+    return torch.cat([both, further[:, 3:]], -1)
+
+
+def _rotvec(matrix: Float[Tensor, "C 3 3"]) -> Float[Tensor, "C 3"]:
+    """Return axes times angles."""
+    half = matrix_to_quaternion_vector(matrix)
+    sine = half.norm(dim=-1, keepdim=True).clamp(1e-12, 1.0)
+    return 2 * sine.arcsin() * half / sine
 
 
 def _velocities(joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T J 3"]:

@@ -279,38 +279,39 @@ class KeypointBodyTracker(nn.Module):
             moved = moved.map(lambda value: value[None])
             return tracker(moved, smooth, progress, waited=math.inf, watch=False)
 
-        used, said = self._of_right_cameras(frames, first_frame)
+        used, off, turn = self._of_right_cameras(frames)
         single = used.map(lambda value: value[0])
         found = refine_cameras(
-            self.rig, single, track, self.fps, refine, former.exchange, smoothing
+            self.rig, single, track, self.fps, refine, former.exchange, smoothing, turn
         )
+        found = found._replace(poses=found.poses._replace(off=off))
         moved = found.frames.map(lambda value: value[None])
         standing = self._refined_feet(feet, found, smoothing)
         result = self.track(
             found.poses, moved, 0, refined=found, first_frame=first_frame, feet=standing
         )
         late = late_note(result.first_frame, TOO_FEW)
-        notes = (*notes_on_refined(self.rig.names, found, refine), *said, *result.notes, *late)
+        given = frames.map(lambda value: value[0])
+        still = notes_on_still_cameras(self.rig.names, given.pixels, given.inlier > 0, first_frame)
+        notes = (*notes_on_refined(self.rig.names, found, refine), *still, *result.notes, *late)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})
 
     def _of_right_cameras(
-        self, frames: KeypointFrame, first_frame: int
-    ) -> tuple[KeypointFrame, tuple[str, ...]]:
-        """Return keypoints [1, T, C, J] of cameras that see the person, and notes on those of others.
+        self, frames: KeypointFrame
+    ) -> tuple[KeypointFrame, Bool[Tensor, "1 T C"], Float[Tensor, "C 3 3"] | None]:
+        """Return keypoints [1, T, C, J] of cameras that see the person, which do not, and their turns.
 
         Small errors of cameras are estimated from all keypoints, so a video that stands still, or of
-        something else, would move the cameras that are right.
+        something else, would move the cameras that are right. So would one that is turned by much.
         """
-        single = frames.map(lambda value: value[0])
-        there, names = single.inlier > 0, self.rig.names
-        said = notes_on_still_cameras(names, single.pixels, there, first_frame)
-        used = without_still_frames(single).map(lambda value: value[None])
-        if len(self.rig) >= LEAST_CAMERAS:
-            off = self.tracker(frames, waited=math.inf).off
-            used = used._replace(inlier=used.inlier.masked_fill(off[..., None], 0.0))
-            said += notes_on_left_out_cameras(names, off[0], first_frame)
-        return used, said
+        used = without_still_frames(frames.map(lambda value: value[0]))
+        used = used.map(lambda value: value[None])
+        if len(self.rig) < LEAST_CAMERAS:
+            return used, torch.zeros_like(used.inlier[..., 0], dtype=torch.bool), None
+        poses = self.tracker(frames, waited=math.inf)
+        used = used._replace(inlier=used.inlier.masked_fill(poses.off[..., None], 0.0))
+        return used, poses.off, poses.turn[0, -1]
 
     def _refined_feet(
         self, feet: KeypointFrame | None, found: RefinedCameras, smoothing: bool
@@ -507,7 +508,7 @@ class KeypointBodyTracker(nn.Module):
         there = frame.inlier > 0
         notes = notes_of(
             self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
-            self.sized, first_frame,
+            poses.off, self.sized, first_frame,
         )  # fmt: skip
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
         notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)

@@ -40,6 +40,7 @@ def notes_of(
     exchanged: Float[Tensor, "T C 2"],
     coasting: Bool[Tensor, " T"],
     alone: Int[Tensor, " T"],
+    off: Bool[Tensor, "T C"],
     sized: bool,
     first_frame: int = 0,
 ) -> tuple[str, ...]:
@@ -48,7 +49,7 @@ def notes_of(
     Args:
         cameras: their names. there: which keypoints there were. inlier: probability that each was a joint's.
         exchanged: probability that sides were exchanged. coasting: frames without a measurement.
-        alone: which of several cameras alone decided, -1 if all did.
+        alone: which of several cameras alone decided, -1 if all did. off: cameras whose keypoints count not.
         sized: whether the person's size, or the camera's height, was given.
         first_frame: number of the first of the frames.
     """
@@ -56,7 +57,8 @@ def notes_of(
     for c, name in enumerate(cameras):
         count = int(there[:, c].sum())
         if count == 0:
-            notes.append(f"camera {name} has no keypoint of this person in any frame")
+            if not bool(off[:, c].any()):
+                notes.append(f"camera {name} has no keypoint of this person in any frame")
             continue
         astray = 1 - float(inlier[:, c][there[:, c]].mean())
         if astray > _DISAGREES:
