@@ -180,9 +180,12 @@ def _run(func, args, kwargs):
 
 
 def _with_tensors(index):
-    if isinstance(index, tuple):
-        return tuple(_with_tensors(part) for part in index)
-    return torch.tensor(index).to(PRETENDED) if isinstance(index, list) else index
+    """Return an index whose places are tensors: a list, or of several axes a tuple inside."""
+    return tuple(map(_as_tensor, index)) if isinstance(index, tuple) else _as_tensor(index)
+
+
+def _as_tensor(places):
+    return torch.tensor(places).to(PRETENDED) if isinstance(places, list | tuple) else places
 
 
 def _inner(x):

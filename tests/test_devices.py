@@ -116,17 +116,17 @@ def test_upper_bodies(keypoints, confidence, method, device):
     close(found["covariance3d"], here.covariance3d, rtol=1e-3, atol=METRE**2)
 
 
-def body_tracker(seen, device, fps=FPS):
-    return moved(torchpose.BodyTracker(seen.rig, "kalman", fps=fps, up="y"), device)
+def body_tracker(seen, device, fps=FPS, **options):
+    return moved(torchpose.BodyTracker(seen.rig, "kalman", fps=fps, up="y", **options), device)
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
-def test_whole_bodies(cameras, device):
+@pytest.mark.parametrize(("cameras", "height"), [(1, None), (1, 1.7), (2, None)])
+def test_whole_bodies(cameras, height, device):
     seen = scene(cameras, 6)
     given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
-    here = body_tracker(seen, "cpu")(**given, smoothing="full")
+    here = body_tracker(seen, "cpu", camera_height=height)(**given, smoothing="full")
     with use_of(device):
-        tracker = body_tracker(seen, device)
+        tracker = body_tracker(seen, device, camera_height=height)
         there = tracker(**given, smoothing="full")
         assert there.joints3d.device.type == device
         state = tracker.init()
