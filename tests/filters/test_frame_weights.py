@@ -8,11 +8,10 @@ from scipy.stats import multivariate_normal
 from tests.filters.oracles import random_covariance, random_mixture, tensor
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.filters import MixtureKalmanFilter, _memoryless
-from torchpose.filters._frame_noise import point_blocks
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._side_by_side import SideBySide
-from torchpose.math._gaussian import kalman_gain
+from torchpose.math._gaussian import kalman_gain, point_blocks
 from torchpose.math._geometric_median import median_columns
 from torchpose.priors import GaussianMixture
 

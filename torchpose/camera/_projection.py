@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpose._core.checks import check_shape
 from torchpose._core.module_state import outside_inference
 from torchpose.errors import CameraError
+from torchpose.math._gaussian import point_blocks
 from torchpose.math._rotations import RotationOrder, euler_to_matrix
 from torchpose.math._unscented import unscented_transform
 
@@ -278,7 +279,7 @@ def arm_in_camera_frame(
     Returns:
         Mean [..., 5, 3] in metres and covariance [..., 5, 3, 3] of hand, elbow, shoulder, head, neck.
     """
-    joints, own = mean[..., :15].unflatten(-1, (5, 3)), joint_blocks(cov[..., :15, :15])
+    joints, own = mean[..., :15].unflatten(-1, (5, 3)), point_blocks(cov[..., :15, :15])
     return _unscented(lambda points: backproject(points, matrix), joints, own)
 
 
@@ -312,7 +313,7 @@ def arm_in_body_frame(
         for m, c in zip(flat_mean.split(_CHUNK), flat_cov.split(_CHUNK), strict=True)
     ]
     joints = torch.cat([joints for joints, _ in parts])
-    covs = torch.cat([joint_blocks(cov) for _, cov in parts])
+    covs = torch.cat([point_blocks(cov) for _, cov in parts])
     return joints.view(*mean.shape[:-1], 5, 3), covs.view(*mean.shape[:-1], 5, 3, 3)
 
 
@@ -320,12 +321,6 @@ def _unscented(
     function: Callable[[Tensor], Tensor], mean: Tensor, cov: Tensor
 ) -> tuple[Tensor, Tensor]:
     return unscented_transform(function, mean, cov, centre=True, directions="cholesky")
-
-
-def joint_blocks(cov: Float[Tensor, "*batch 15 15"]) -> Float[Tensor, "*batch 5 3 3"]:
-    """Return the covariances of five joints, of the covariance of them all."""
-    blocks = cov.unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
-    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
 
 
 def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *rest"]) -> Tensor:
@@ -340,4 +335,4 @@ def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *r
 
 def pixel_covariances(cov: Float[Tensor, "*batch 21 21"]) -> Float[Tensor, "*batch 5 2 2"]:
     """Return the covariances of (u, v) of the five joints of an arm, pixels squared."""
-    return joint_blocks(cov[..., :15, :15])[..., :2, :2]
+    return point_blocks(cov[..., :15, :15])[..., :2, :2]

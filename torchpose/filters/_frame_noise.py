@@ -22,8 +22,8 @@ from torchpose._core.value_checks import values_visible
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._side_by_side import SideBySide
-from torchpose.filters._weights import between
-from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
+from torchpose.filters._weights import between, mixed
+from torchpose.math._gaussian import LOG_2PI, mended_cholesky, point_blocks, spare_columns
 from torchpose.math._geometric_median import with_medians
 
 Tracks = MixtureKalmanFilter | SideBySide
@@ -194,21 +194,8 @@ def own_moments(
         return mean, None
     dim = rows.shape[-1]
     moved = between(weights, means, mean) - explained[..., :dim, :dim]
-    prior = mixed(weights, parts.covs.to(rows), of_points)
+    prior = mixed(weights, parts.covs)
     return mean, prior + (point_blocks(moved) if of_points else moved)
-
-
-def mixed(weights: Float[Tensor, "*A N K"], covs: Tensor, of_points: bool) -> Tensor:
-    """Return sum_j w_j P_j, of whole covariances or of those of points."""
-    n_dims = 3 if of_points else 2
-    flat = covs.flatten(-n_dims).to(weights.dtype)
-    return (weights @ flat).unflatten(-1, covs.shape[-n_dims:])
-
-
-def point_blocks(covs: Float[Tensor, "*batch D D"]) -> Float[Tensor, "*batch P 3 3"]:
-    """Return the covariances of each three consecutive dimensions, P = D / 3."""
-    blocks = covs.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
-    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
 
 
 def variances_of(covs: Tensor, of_points: bool) -> Tensor:

@@ -24,9 +24,7 @@ from torchpose.filters._frame_noise import (
     condition_own,
     log_normaliser,
     measured_parts,
-    mixed,
     own_moments,
-    point_blocks,
     variances_of,
 )
 from torchpose.filters._measurements import Measurements
@@ -34,8 +32,8 @@ from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
 from torchpose.filters._recompute import recomputed, wants_gradient
 from torchpose.filters._side_by_side import SideBySide, stacked
-from torchpose.filters._weights import WeightRule, between, frame_weights, normalise
-from torchpose.math._gaussian import Gain, kalman_gain
+from torchpose.filters._weights import WeightRule, between, frame_weights, mixed, normalise
+from torchpose.math._gaussian import Gain, kalman_gain, point_blocks
 from torchpose.math._geometric_median import median_columns, with_medians
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
@@ -220,7 +218,7 @@ def _moments(
     if not return_cov:
         return mean, None
     apart = between(weights, means, mean)
-    return mean, mixed(weights, covs, of_points) + (point_blocks(apart) if of_points else apart)
+    return mean, mixed(weights, covs) + (point_blocks(apart) if of_points else apart)
 
 
 def _weighed(

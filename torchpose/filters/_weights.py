@@ -70,9 +70,15 @@ def within_and_between(weights: Tensor, mean: Tensor, estimate: Tensor, cov: Ten
     Args:
         weights: w [B, M]. mean: m_j [B, M, D]. estimate: m [B, D]. cov: P [M, D, D] or [B, M, D, D].
     """
-    flat = cov.flatten(-2).to(weights.dtype)
-    within = weights @ flat if cov.ndim == 3 else (weights[:, None] @ flat)[:, 0]
-    return within.unflatten(-1, cov.shape[-2:]) + between(weights, mean, estimate)
+    own = cov.ndim > mean.ndim
+    within = mixed(weights[:, None], cov)[:, 0] if own else mixed(weights, cov)
+    return within + between(weights, mean, estimate)
+
+
+def mixed(weights: Float[Tensor, "*batch N M"], covs: Tensor) -> Tensor:
+    """Return sum_j w_j P_j, [*batch, N, ...], of whole covariances or those of points, [*batch, M, ...]."""
+    first = weights.ndim - 1
+    return (weights @ covs.flatten(first).to(weights)).unflatten(-1, covs.shape[first:])
 
 
 def between(

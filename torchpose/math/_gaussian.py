@@ -308,6 +308,12 @@ def spare_columns(columns: int) -> int:
     return _LANES - columns % _LANES
 
 
+def point_blocks(covs: Float[Tensor, "*batch D D"]) -> Float[Tensor, "*batch P 3 3"]:
+    """Return the covariances of each three consecutive dimensions, P = D / 3."""
+    blocks = covs.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
+    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+
+
 def _multiply(a: Tensor, b: Tensor) -> Tensor:
     """Return A @ B; matmul itself takes 2 us longer to see that neither has to be broadcast."""
     if a.ndim == b.ndim == 3 and a.shape[0] == b.shape[0]:

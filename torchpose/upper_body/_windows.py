@@ -16,12 +16,12 @@ from torchpose._core.module_state import derived, index_tensor, outside_inferenc
 from torchpose.camera._virtual_camera import memory_frames, planes_in_view
 from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
-from torchpose.filters._frame_noise import point_blocks
 from torchpose.filters._measurements import Measurements, check_lengths
 from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
 from torchpose.filters._side_by_side import SideBySide
+from torchpose.math._gaussian import point_blocks
 from torchpose.math._geometric_median import median_columns
 from torchpose.math._rotations import matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
