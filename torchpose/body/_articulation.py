@@ -27,7 +27,7 @@ from torchpose.body._skeleton import BODY_15, BodySkeleton, other_side
 from torchpose.math._rotations import (
     cross_matrix,
     exponential,
-    matrix_to_quaternion_vector,
+    matrix_to_rotvec,
     minimal_rotation,
     quaternion_vector_to_matrix,
 )
@@ -155,7 +155,7 @@ class Articulation(nn.Module):
 
     def relative_angles(self, point: BodyPoint) -> Float[Tensor, "*batch Q"]:
         """Return rotation vectors of all parts but the root about their centres, on their axes, radians."""
-        turns = _rotation_vectors(point.rotations)
+        turns = matrix_to_rotvec(point.rotations)
         return turns[..., self.axis_part[self.n_root :], self.axis[self.n_root :]]
 
     def scales_of(self, lengths: Float[Tensor, "*batch J"]) -> Float[Tensor, "*batch G"]:
@@ -204,7 +204,7 @@ class Articulation(nn.Module):
 
     def difference(self, a: BodyPoint, b: BodyPoint) -> Float[Tensor, "*batch N"]:
         """Return the step that leads from b to a, to first order where both axes of a limb turn."""
-        turns = _rotation_vectors(b.rotations.mT @ a.rotations)
+        turns = matrix_to_rotvec(b.rotations.mT @ a.rotations)
         return torch.cat(
             [
                 a.position - b.position,
@@ -334,13 +334,6 @@ def mirror_of(articulation: Articulation) -> Mirror:
     sign = [1.0 if a == 0 else -1.0 for _, a in places]
     columns = torch.tensor([places.index(place) for place in other])
     return Mirror(columns, torch.tensor(sign, dtype=torch.float64))
-
-
-def _rotation_vectors(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Return axis times angle, radians."""
-    quaternion = matrix_to_quaternion_vector(rotations)
-    length = quaternion.norm(dim=-1, keepdim=True).clamp(1e-12, 1.0)
-    return 2 * quaternion * (length.asin() / length)
 
 
 def _paths(parents: Sequence[int]) -> Tensor:

@@ -234,6 +234,13 @@ def matrix_to_quaternion_vector(
     return quaternion_to_vector(row / row.norm(dim=-1, keepdim=True))
 
 
+def matrix_to_rotvec(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return the Rodrigues vector of a rotation matrix, radians; the inverse of `rotvec_to_matrix`."""
+    quaternion = matrix_to_quaternion_vector(rotation)
+    length = quaternion.norm(dim=-1, keepdim=True).clamp(1e-12, 1.0)
+    return 2 * quaternion * (length.asin() / length)
+
+
 def conjugate(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Return the inverse of a rotation, -v.
 

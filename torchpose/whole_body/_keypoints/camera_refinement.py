@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
-from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
+from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
 from torchpose.whole_body._keypoints.camera_bundle import (
     N_ERRORS,
     BundleInputs,
@@ -210,9 +210,8 @@ def _some_are_turned(turn: Float[Tensor, "C 3 3"]) -> bool:
 
 def _turns_of(rig: CameraRig, turn: Float[Tensor, "C 3 3"]) -> Float[Tensor, "C 3"]:
     """Return the rotations in camera axes that turns of world axes are, of cameras about their centres."""
-    return torch.where(
-        is_turned(turn)[:, None], _rotvec(rig.rotation @ turn.mT @ rig.rotation.mT), 0.0
-    )
+    rotvec = matrix_to_rotvec(rig.rotation @ turn.mT @ rig.rotation.mT)
+    return torch.where(is_turned(turn)[:, None], rotvec, 0.0)
 
 
 def _one_after_another(
@@ -221,15 +220,8 @@ def _one_after_another(
     """Return errors of poses that are turned by those that are known, and then have further ones."""
     first, then = rotvec_to_matrix(known[:, :3]), rotvec_to_matrix(further[:, :3])
     turned = known[:, :3].any(-1, keepdim=True)
-    both = torch.where(turned, _rotvec(then @ first), further[:, :3])
+    both = torch.where(turned, matrix_to_rotvec(then @ first), further[:, :3])
     return torch.cat([both, further[:, 3:]], -1)
-
-
-def _rotvec(matrix: Float[Tensor, "C 3 3"]) -> Float[Tensor, "C 3"]:
-    """Return axes times angles."""
-    half = matrix_to_quaternion_vector(matrix)
-    sine = half.norm(dim=-1, keepdim=True).clamp(1e-12, 1.0)
-    return 2 * sine.arcsin() * half / sine
 
 
 def _velocities(joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T J 3"]:
