@@ -34,11 +34,13 @@ class RigMaps(NamedTuple):
 
     Attributes:
         matrix: K R, [C, 3, 3]. shift: K t, [C, 3]. log_area: [C], of the area of outliers, pixels squared.
+        centre: [C, 3], the places of the cameras, metres.
     """
 
     matrix: Tensor
     shift: Tensor
     log_area: Tensor
+    centre: Tensor
 
     @classmethod
     def of(cls, rig: CameraRig) -> Self:
@@ -50,7 +52,8 @@ class RigMaps(NamedTuple):
             for f, size in zip(focal, rig.sizes, strict=True)
         ]
         log_area = torch.tensor(areas, dtype=shift.dtype).div(4).log().to(shift.device)
-        return cls(rig.matrix @ rig.rotation, shift, log_area)
+        matrix = rig.matrix @ rig.rotation
+        return cls(matrix, shift, log_area, -torch.linalg.solve(matrix, shift))
 
 
 class KeypointFrame(NamedTuple):

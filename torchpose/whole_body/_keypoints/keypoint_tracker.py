@@ -189,10 +189,10 @@ class KeypointTracker(nn.Module):
             )
         if lifted is not None:
             spread = torch.where(lifted.std.isfinite(), lifted.std, stream.spread)
-            stream = stream._replace(spread=spread)
-        seen = (found.weighed.inlier > 0.5).any(-2)
-        unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
-        stream = stream._replace(unseen=unseen, lost=self._lost(stream, frame, found.weighed))
+            seen = found.weighed.inlier[:, 0] > 0.5
+            unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
+            stream = stream._replace(spread=spread, unseen=unseen)
+        stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
         return stream, self._posed(stream, found, due), found
 
     def _posed(

@@ -63,7 +63,6 @@ def of_any_size(
         cov: metres squared. joints: metres. alone: the camera, -1 where there are several.
         maps: the cameras. std: of the log of persons' sizes.
     """
-    centres = -torch.linalg.solve(maps.matrix, maps.shift)
-    away = std * (joints - centres[alone.clamp_min(0)].unsqueeze(-2))
+    away = std * (joints - maps.centre[alone.clamp_min(0)].unsqueeze(-2))
     wider = cov + away[..., None] * away[..., None, :]
     return torch.where((alone >= 0)[..., None, None, None], wider, cov)

@@ -54,8 +54,7 @@ class OnlyCamera:
     @property
     def centre(self) -> Float[Tensor, "3"]:
         """Return the place of the camera."""
-        maps = self.filter.maps
-        return -torch.linalg.solve(maps.matrix[0], maps.shift[0])
+        return self.filter.maps.centre[0]
 
     def at_size(self, step: KeypointStep) -> KeypointStep:
         """Return a frame at the sizes that are believed after it."""
