@@ -105,6 +105,11 @@ def _righted(
     return frame._replace(inlier=frame.inlier.masked_fill(off[..., None], 0.0))
 
 
+def _any_wrong(off: Bool[Tensor, "B C"], turn: Float[Tensor, "B C 3 3"]) -> Bool[Tensor, " B"]:
+    """Return whose cameras include one that counts not, or is turned."""
+    return (off | is_turned(turn)).any(-1)
+
+
 def noted(faults: CameraFaults, frame: KeypointFrame, used: KeypointFrame) -> CameraFaults:
     """Return the faults with a frame kept for the next one, and of `without_still` what of it is used."""
     there, use = ((one.inlier > 0).any(-1) for one in (frame, used))
@@ -175,7 +180,7 @@ def find_faults(
     right = _righted(given, turn, off, filter.maps)
     found = start(filter, right, _HEADINGS)
     evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
-    wrong = (off | is_turned(turn)).any(-1)
+    wrong = _any_wrong(off, turn)
     refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
     evidence = torch.where(refused.any(-1) & wrong, -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
@@ -191,10 +196,7 @@ def find_faults(
         looks=looks,
     )
     rows = better.nonzero().squeeze(-1)
-    after = mapped(
-        lambda old, other: old.index_copy(0, rows, other[rows]),
-        faults, new,
-    )  # fmt: skip
+    after = mapped(lambda old, other: old.index_copy(0, rows, other[rows]), faults, new)
     after = after._replace(doubted=torch.where(better, 0.0, pause))
     return after, known.put(rows, found.take(best[rows])), better
 
@@ -238,7 +240,7 @@ def looked_at_again(
     enough = _enough(frame).sum(-1) >= LEAST_CAMERAS
     looks, rows, best = looked_again(faults.looks, frame, enough, filter.maps, filter.fps)
     turn = faults.turn.index_copy(0, rows, best)
-    wrong = (faults.off | is_turned(turn)).any(-1)
+    wrong = _any_wrong(faults.off, turn)
     looks = looks._replace(n_frames=torch.where(wrong, looks.n_frames, 0.0))
     return faults._replace(turn=turn, wrong=wrong, looks=looks)
 
@@ -287,7 +289,7 @@ def with_returned(
     sees = _enough(frame) & (weighed.inlier.sum(-1) >= FEW_INLIERS * frame.inlier.sum(-1))
     back = torch.where(faults.off & sees, faults.back + 1, 0.0)
     off = faults.off & (back <= _RETURN * filter.fps)
-    wrong = (off | is_turned(faults.turn)).any(-1)
+    wrong = _any_wrong(off, faults.turn)
     return faults._replace(off=off, back=back, wrong=wrong)
 
 

@@ -99,11 +99,8 @@ def find_turns(
     rays = _rays(frame, maps)
     eye = torch.eye(3).to(rays)
     if known is None:
-        turn, widths, joints = (
-            eye.expand(*free.shape, 3, 3),
-            _WIDTHS,
-            _first_joints(frame, free, maps),
-        )
+        turn, widths = eye.expand(*free.shape, 3, 3), _WIDTHS
+        joints = _first_joints(frame, free, maps)
     else:
         turn, widths = known, _WIDTHS_OF_KNOWN
         joints = triangulate_all(maps, turned(frame, turn, maps), frame.inlier > 0)
