@@ -132,7 +132,21 @@ def test_times_are_those_of_the_recording(scene) -> None:
     gap = hand.patches[0].get_extents().transformed(hand.transData.inverted())
     assert (gap.x0, gap.x1) == pytest.approx((2 + 29.5 / 30, 2 + 59.5 / 30))
     strip = viz.plot_pose_strip(scene.joints, n_frames=2, first_frame=60)
-    assert [ax.get_title() for ax in strip.axes if ax.get_title()] == ["2.0 s", "6.0 s"]
+    assert [text.get_text() for text in strip.axes[0].texts[1:]] == ["2.0 s", "6.0 s"]
+
+
+def test_no_pose_of_a_strip_is_cut_off_or_runs_into_its_neighbour(scene) -> None:
+    """From the side an arm stretched to the camera is wider than anything from the front."""
+    joints = scene.joints.clone()
+    joints[0, 7, 2] -= 2.0
+    figure = viz.plot_pose_strip(joints[:3], n_frames=3)
+    figure.canvas.draw()
+    for ax in figure.axes:
+        starts = [c.get_offsets()[:, 0] for c in ax.collections if len(c.get_offsets()) == 8]
+        assert len(starts) == 3
+        for column, xs in enumerate(starts):
+            left, right = (ax.get_xlim()[1] * (column + side) / 3 for side in (0, 1))
+            assert left < xs.min() and xs.max() < right
 
 
 def test_inferred_joints_of_a_body_are_hollow() -> None:

@@ -37,6 +37,17 @@ def test_help_comes_without_torch():
     assert "torch" not in python("-c", code).stdout.splitlines()[-1].split()
 
 
+def test_what_a_command_loads_is_left_out_of_collections_of_garbage():
+    code = (
+        "import gc; from torchpose.cli import main\n"
+        "passes = []; gc.callbacks.append(lambda phase, info: passes.append(info['generation']))\n"
+        "main(['track', '--help']); print(gc.isenabled(), gc.get_freeze_count() > 100_000, passes.count(2))"
+    )
+    enabled, frozen, whole = python("-c", code).stdout.split()[-3:]
+    assert (enabled, frozen) == ("True", "True")
+    assert int(whole) <= 1
+
+
 def test_help(torchpose):
     for done in (torchpose("--help"), torchpose("-h")):
         assert done.code == 0 and done.err == ""

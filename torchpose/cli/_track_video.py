@@ -4,6 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,17 +81,24 @@ def track_video(
         names = _names(people, source.reopenable)
         # first of all: the rest only shows them
         written = results.commit(write_people(people, results.stage))
-        if pictures:
-            written += results.commit(write_pictures(people[0].track, results.stage))
+        # Python is free for the pictures for most of the time that the encoder takes
+        with ThreadPoolExecutor(1) as beside:
+            drawing = beside.submit(_pictures_of, people[0], results.stage, pictures)
+            try:
+                if overlay and source.reopenable:
+                    write_overlay(results.stage / _OVERLAY, source.reopen(), people, n_frames)
+            finally:
+                written += results.commit(drawing.result())
         if overlay:
-            drawn = results.stage / _OVERLAY
-            if source.reopenable:
-                write_overlay(drawn, source.reopen(), people, n_frames)
             title = Path(job.input).name
             shown = _write_report(results.stage, people, names, n_frames, facts, notes, title)
             written += results.commit(shown)
     print(_summary(people, names, written, facts, results.notes))
     return max(report_failure(person.track) for person in people)
+
+
+def _pictures_of(person: "TrackedPerson", out: Path, wanted: bool) -> list[Path]:
+    return write_pictures(person.track, out) if wanted else []
 
 
 def _open(where: str, fps: float | None) -> "VideoSource":

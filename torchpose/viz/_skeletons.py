@@ -77,6 +77,8 @@ def draw_skeleton(
     Raises:
         ShapeError: joints of another shape, or of another number than there are colours.
     """
+    from matplotlib.collections import LineCollection
+
     check_shape("joints", joints, [None, 2])
     colors = list(colors or joint_colors(UPPER_BODY))
     if len(colors) != joints.shape[0]:
@@ -88,12 +90,13 @@ def draw_skeleton(
     if covariance is not None:
         for point, matrix, color in zip(points, covariance, colors, strict=True):
             _draw_ellipse(ax, point, matrix, color, level, alpha)
-    for a, b in limbs:
-        color = colors[a] if colors[a] == colors[b] else MIDDLE
-        ax.plot(
-            points[[a, b], 0], points[[a, b], 1], color=color, linewidth=linewidth, alpha=alpha,
-            solid_capstyle="round", zorder=3,
+    if len(limbs):
+        strokes = [colors[a] if colors[a] == colors[b] else MIDDLE for a, b in limbs]
+        lines = LineCollection(
+            points[list(limbs)], colors=strokes, linewidths=linewidth, alpha=alpha,
+            capstyle="round", zorder=3,
         )  # fmt: skip
+        ax.add_collection(lines)
     filled = [True] * len(colors) if observed is None else observed.tolist()
     faces = [c if f else "white" for c, f in zip(colors, filled, strict=True)]
     ax.scatter(
@@ -301,26 +304,34 @@ def plot_pose_strip(
     views = ((0, 1),) if joints.shape[-1] == 2 else ((0, 1), (2, 1))
     chosen = joints if truth is None else torch.cat([joints, truth], 1)
     low, high = _limits(chosen[frames], margin=0.06)
-    tall = 1.6 * float((high - low)[1] / (high - low)[0])
-    height = lines * (len(views) * tall + 0.3 + 0.15 * (labels is not None)) + 0.7
+    size = (high - low).tolist()
+    wide = max(size[across] for across, _ in views)
+    height = lines * (len(views) * 1.6 * size[1] / wide + 0.3 + 0.15 * (labels is not None)) + 0.7
     figure = new_figure(columns * 1.6, height, title)
-    grid = figure.subplots(lines * len(views), columns, squeeze=False)
-    for ax in grid.flat:
+    rows = figure.subplots(lines * len(views), 1, squeeze=False)[:, 0]
+    for row, ax in enumerate(rows):  # few axes with all frames side by side: each one costs time
         ax.set_axis_off()
+        ax.set_aspect("equal")
+        ax.set(xlim=(0, columns * wide), ylim=(float(high[1]), float(low[1])))
+        if len(views) == 2:
+            label_row(ax, ("front", "side")[row % 2])
     for place, frame in enumerate(frames):
         line, column = divmod(place, columns)
-        for row, pick in enumerate(views):
-            ax = grid[line * len(views) + row, column]
+        middle = (column + 0.5) * wide
+        for row, pick in enumerate(views, line * len(views)):
+            shift = torch.zeros(2, dtype=torch.float64)
+            shift[0] = middle - float(low[pick[0]] + high[pick[0]]) / 2
             if truth is not None:
-                _draw_truth(ax, truth[frame][:, pick], linewidth=1.5)
+                _draw_truth(rows[row], truth[frame][:, pick].cpu() + shift, linewidth=1.5)
             seen = None if observed is None else observed[frame]
-            draw_skeleton(ax, joints[frame][:, pick], observed=seen, linewidth=2.2)
-            _set_view(ax, low, high, pick)
-            if len(views) == 2 and column == 0:
-                label_row(ax, ("front", "side")[row])
+            drawn = joints[frame][:, pick].cpu() + shift
+            draw_skeleton(rows[row], drawn, observed=seen, linewidth=2.2)
         word = f"\n{labels[frame]}" if labels is not None else ""
-        top = grid[line * len(views), column]
-        top.set_title(f"{(frame + first_frame) / fps:.1f} s{word}", fontsize=SMALL, color=INK)
+        top = rows[line * len(views)]
+        top.text(
+            middle, 1.0, f"{(frame + first_frame) / fps:.1f} s{word}", fontsize=SMALL, color=INK,
+            ha="center", va="bottom", transform=top.get_xaxis_transform(),
+        )  # fmt: skip
     add_legend(figure, _legend_entries(observed, None, truth, 0.9))
     return figure
 
