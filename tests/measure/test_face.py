@@ -162,6 +162,15 @@ def test_one_face_in_two_overlapping_regions_is_one_detection():
     assert states[-1].unseen.tolist() == [0, 2] and states[-1].next_identity == 2
 
 
+def test_of_detections_that_overlap_the_one_where_the_face_is_known_to_be_is_taken():
+    """Whatever their order: a hand before a face gives a second box, over its upper half."""
+    face, second = [300.0, 200.0, 90.0], [290.0, 168.0, 84.0]
+    frames = [[face]] * 6 + [[second, face]] * 20
+    _, states, _ = follow(frames, every=1, whole_every=100)
+    assert states[-1].mean[:, :3].tolist() == [pytest.approx(face, abs=0.5)]
+    assert states[-1].next_identity == 1
+
+
 def test_bad_input_is_refused():
     with pytest.raises(InputError, match="memory at least"):
         FaceTracker(nobody, min_hits=5, memory=4)

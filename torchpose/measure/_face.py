@@ -334,7 +334,10 @@ class FaceTracker(nn.Module):
         for turn in (-_TILT, _TILT):
             if not len(found):
                 found = _turned_search(self.detector, part, _whole(part, region, scale), turn)
-        return scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
+        found = scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
+        if len(found) > 1:  # the first of detections that overlap is kept, so the likeliest comes first
+            found = found[(found - found.new_tensor(face)).norm(dim=1).argsort(stable=True)]
+        return found
 
     def _predict(self, tracks: FaceTracks) -> FaceTracks:
         spread = (self.acceleration * tracks.mean[:, 2, None]).square().expand(-1, 6)
