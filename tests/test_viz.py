@@ -154,7 +154,7 @@ def test_inferred_joints_of_a_body_are_hollow() -> None:
     observed = torch.ones(2, 15).bool()
     observed[1, 3] = False
     figure = plot_body_strip(joints, observed=observed)
-    white = [(ax.collections[0].get_facecolor()[:, :3] == 1).all(-1).nonzero()[0].tolist()
+    white = [(ax.collections[-1].get_facecolor()[:, :3] == 1).all(-1).nonzero()[0].tolist()
              for ax in figure.axes]  # fmt: skip
     assert white == [[], [3], [], [3]]
     assert [text.get_text() for text in figure.legends[0].get_texts()][2:] == [

@@ -254,11 +254,13 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(clip, track, monkey
     assert list(out.iterdir()) == []
 
 
-def test_poses_are_kept_when_the_overlay_does_not_fit(clip, track, monkeypatch):
+def test_poses_and_pictures_are_kept_when_the_overlay_does_not_fit(clip, track, monkeypatch):
     monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
-    done, out = track(clip[0])
+    done, out = track(clip[0], "--pictures", "true")
     assert done.code == 2 and "No space left" in done.err
-    assert {LIST, *(f"poses{s}" for s in SUFFIXES)} == {p.name for p in out.iterdir()}
+    pictures = ["pose_strip.png", "joint_curves.png"]
+    kept = {LIST, *pictures, *(f"poses{s}" for s in SUFFIXES)}
+    assert kept == {p.name for p in out.iterdir()}
 
 
 def test_torch_frames_are_frames(clip, files):

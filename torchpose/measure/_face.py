@@ -335,7 +335,7 @@ class FaceTracker(nn.Module):
             if not len(found):
                 found = _turned_search(self.detector, part, _whole(part, region, scale), turn)
         found = scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
-        if len(found) > 1:  # the first of detections that overlap is kept, so the likeliest comes first
+        if len(found) > 1:  # of those that overlap only the first is kept: the likeliest
             found = found[(found - found.new_tensor(face)).norm(dim=1).argsort(stable=True)]
         return found
 
