@@ -5,8 +5,8 @@ a step is two products of that width, the rows of the measured dimensions, and o
 
 A <- [F, 0; 0, 1] A [F, 0; 0, 1]^T + [N, b; b^T, 0],   W = L^-1 [H P, H x - z],   A <- A - W^T W,
 
-with L L^T = H P H^T + R; the last column of W is minus the whitened innovation. c is not used. The measured
-dimensions come first, so that H P is a slice.
+with L L^T = H P H^T + R; the last column of W is minus the whitened innovation, and c then
+minus the square of that. The measured dimensions come first, so that H P is a slice.
 """
 
 import itertools
@@ -33,8 +33,9 @@ from torchpose.filters._outputs import (
 from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
-TRACK_NUMBERS = 1 << 18
-"""Numbers in the tracks that are stepped at a time: 2 MB, which stay in the cache."""
+TRACK_NUMBERS = 1 << 17
+"""Numbers in the tracks that are stepped at a time: 1 MB, which stay in the cache beside other memory."""
+_LOGS = 16  # standard deviations whose product is within range, and costs one logarithm
 
 
 class JointModel(NamedTuple):
@@ -98,6 +99,12 @@ def joint_model(model: MixtureKalmanFilter, time: int) -> JointModel:
     return make() if time < model.burn_in else derived(model, "joint", model.sources, make)
 
 
+def joint_models(model: MixtureKalmanFilter, n_frames: int) -> list[JointModel]:
+    """Return the predictions into the first frames."""
+    steady = joint_model(model, model.burn_in)
+    return [steady if t >= model.burn_in else joint_model(model, t) for t in range(n_frames)]
+
+
 def joint_problems(frames: Measurements) -> list[JointProblem]:
     """Return what is measured in every frame, for `JointTracks.correct`."""
     cov = frames.cov[None, None] if frames.cov.ndim == 2 else frames.cov
@@ -109,14 +116,28 @@ def joint_problems(frames: Measurements) -> list[JointProblem]:
     return [JointProblem(z, r, gap, seen, norm) for z, r, seen, norm, gap in rows]
 
 
+class _Room:
+    """Holds memory for the tracks, and the views of it that steps use, which take long to make.
+
+    Args:
+        state: the tracks [B, M, E, E]. dim: D. n_observed: Z.
+
+    Attributes:
+        flat: one after the other [B M, E, E]. rows, block: H P and H P H^T, beside H x.
+        mean: [B, M, D]. corner: c [B, M].
+    """
+
+    def __init__(self, state: Tensor, dim: int, n_observed: int) -> None:
+        self.state, self.flat = state, state.flatten(0, 1)
+        self.rows, self.block = state[..., :n_observed, :], state[..., :n_observed, :n_observed]
+        self.mean, self.corner = state[..., :dim, dim], state[..., dim, dim]
+
+
 class JointTracks:
     """Steps M tracks of B elements in memory that is used again: fresh pages cost as much as the products.
 
     Args:
         model: the filter. mean: [B, M, D]. cov: [B, M, D, D].
-
-    Attributes:
-        state: the tracks [B, M, E, E]. dim: D.
     """
 
     def __init__(
@@ -129,20 +150,30 @@ class JointTracks:
         mean, cov = mean[..., order], cov[..., order[:, None], order]
         self.dim, self.n_observed = model.dim, len(model.observed)
         width = self.dim + spare_columns(self.dim)
-        self.state = cov.new_zeros(*mean.shape[:-1], width, width)
-        self.state[..., : self.dim, : self.dim] = cov
-        self.state[..., : self.dim, self.dim] = mean
-        self.state[..., self.dim, : self.dim] = mean
-        self._make_room()
+        state = cov.new_zeros(*mean.shape[:-1], width, width)
+        state[..., : self.dim, : self.dim] = cov
+        state[..., : self.dim, self.dim] = mean
+        state[..., self.dim, : self.dim] = mean
+        self._make_room(state)
 
-    def _make_room(self) -> None:
+    def _make_room(self, state: Tensor) -> None:
         """Allocate the memory that every step uses again."""
-        self._other, self._matrix, self._moved = (torch.empty_like(self.state) for _ in range(3))
+        sizes = self.dim, self.n_observed
+        self._now, self._other = _Room(state, *sizes), _Room(torch.empty_like(state), *sizes)
+        self._matrix, self._moved = (torch.empty_like(self._now.flat) for _ in range(2))
+        self._measured = state.new_empty(self._now.rows.shape)
+        self._innovation = self._measured[..., self.dim]
+        self._first = state.shape[1] * torch.arange(len(state), device=state.device)[:, None]
+
+    @property
+    def state(self) -> Float[Tensor, "B M E E"]:
+        """Return the tracks."""
+        return self._now.state
 
     @property
     def mean(self) -> Float[Tensor, "B M D"]:
         """Return the means, in the order of the filter's state."""
-        return self.state[..., self.dim].index_select(-1, self._back)
+        return self._now.mean.index_select(-1, self._back)
 
     @property
     def cov(self) -> Float[Tensor, "B M D D"]:
@@ -151,26 +182,21 @@ class JointTracks:
 
     def take(self, parent: Int[Tensor, "B M"]) -> None:
         """Replace the tracks of every element by some of them, of which some may be taken again."""
-        batch, n_tracks = self.state.shape[:2]
-        index = parent + n_tracks * torch.arange(batch, device=parent.device)[:, None]
-        if parent.shape[1] != n_tracks:
-            self.state = self.state.flatten(0, 1)[index]
-            self._make_room()
+        index = (parent + self._first).flatten()
+        if len(index) != len(self._now.flat):
+            self._make_room(self._now.flat[index].unflatten(0, parent.shape))
             return
-        torch.index_select(
-            self.state.flatten(0, 1), 0, index.flatten(), out=self._other.flatten(0, 1)
-        )
-        self.state, self._other = self._other, self.state
+        torch.index_select(self._now.flat, 0, index, out=self._other.flat)
+        self._now, self._other = self._other, self._now
 
     def predict(self, model: JointModel, component: Int[Tensor, "B M"]) -> None:
         """Predict the tracks by a component each (BL 34, 37)."""
-        chosen, matrix, moved = component.flatten(), self._matrix.flatten(0, 1), self._moved
-        predicted, moved = self._other.flatten(0, 1), moved.flatten(0, 1)
-        torch.index_select(model.matrix, 0, chosen, out=matrix)
-        torch.bmm(matrix, self.state.flatten(0, 1), out=moved)
+        chosen, predicted = component.flatten(), self._other.flat
+        torch.index_select(model.matrix, 0, chosen, out=self._matrix)
+        torch.bmm(self._matrix, self._now.flat, out=self._moved)
         torch.index_select(model.noise, 0, chosen, out=predicted)
-        predicted.baddbmm_(moved, matrix.mT)
-        self.state, self._other = self._other, self.state
+        predicted.baddbmm_(self._moved, self._matrix.mT)
+        self._now, self._other = self._other, self._now
 
     def correct(
         self, problem: JointProblem
@@ -180,35 +206,40 @@ class JointTracks:
         Returns:
             The log-likelihood of every track, and the jitter of its covariance, as `mended_cholesky`.
         """
-        n_obs = self.n_observed
-        joint, block = self.state[..., :n_obs, :], self.state[..., :n_obs, :n_obs]
+        now, measured = self._now, self._measured
         if problem.both is None:
-            innovation = block + problem.noise
-            joint = joint.clone(memory_format=torch.contiguous_format)
+            covariance = now.block + problem.noise
+            measured.copy_(now.rows)
         else:
-            innovation = torch.addcmul(problem.noise, problem.both, block)
-            joint = joint * problem.mask
-        joint[..., self.dim] -= problem.z
-        factor, jitter = mended_cholesky(innovation)
-        white = torch.linalg.solve_triangular(factor, joint, upper=False)
-        flat = white.flatten(0, 1)
-        self.state.flatten(0, 1).baddbmm_(flat.mT, flat, alpha=-1)
-        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        squared = white[..., self.dim].square().sum(-1)
-        return torch.add(problem.log_norm - log_det, squared, alpha=-0.5), jitter
+            covariance = torch.addcmul(problem.noise, problem.both, now.block)
+            torch.mul(now.rows, problem.mask, out=measured)
+        self._innovation.sub_(problem.z)
+        factor, jitter = mended_cholesky(covariance)
+        torch.linalg.solve_triangular(factor, measured, upper=False, out=measured)
+        white = measured.flatten(0, 1)
+        now.corner.zero_()  # which W^T W then makes minus the squared innovation
+        now.flat.baddbmm_(white.mT, white, alpha=-1)
+        return torch.add(problem.log_norm - _half_log_det(factor), now.corner, alpha=0.5), jitter
+
+
+def _half_log_det(factor: Float[Tensor, "*batch Z Z"]) -> Float[Tensor, "*batch"]:
+    """Return log det L; of few factors by one logarithm, whose product is within range."""
+    pivots = factor.diagonal(dim1=-2, dim2=-1)
+    return pivots.prod(-1).log() if pivots.shape[-1] <= _LOGS else pivots.log().sum(-1)
 
 
 def joint_estimate(
     tracks: JointTracks,
     log_weights: Float[Tensor, "B M"],
-    log_evidence: Float[Tensor, " B"],
+    log_evidence: Float[Tensor, "B *M"],
     jitters: Sequence[Tensor | None],
     return_cov: bool,
 ) -> StepOutput:
     """Return the estimate of a frame (BL 48); without covariances its mean is that of the tracks [B, M, D].
 
     Args:
-        log_evidence: also where nothing is measured. jitters: of its covariances.
+        log_evidence: also where nothing is measured; or the log-weights before they are normalised [B, M],
+            whose sum it is. jitters: of its covariances.
     """
     mean = tracks.mean.to(log_weights)
     mended = any(jitter is not None for jitter in jitters)
@@ -221,12 +252,14 @@ def joint_estimate(
 
 
 def stacked(steps: Sequence[StepOutput], frames: Measurements) -> FilterOutput:
-    """Stack the frames of some sequences, and average the means of tracks, all at once."""
+    """Stack the frames of some sequences; average the means of tracks, and sum their weights, all at once."""
     log_weights = torch.stack([step.log_weights for step in steps], 1)
     mean = torch.stack([step.mean for step in steps], 1)
     if mean.ndim == 4:
         mean = (log_weights.exp()[..., None, :] @ mean)[..., 0, :]
     evidence = torch.stack([step.log_evidence for step in steps], 1)
+    if evidence.ndim == 3:
+        evidence = torch.logsumexp(evidence, -1)
     evidence = torch.where(frames.mask.any(-1), evidence, torch.zeros_like(evidence))
     covs = [step.cov for step in steps if step.cov is not None]
     none = mending(evidence)

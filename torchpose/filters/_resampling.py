@@ -35,15 +35,14 @@ def systematic(
     Reference:
         Kitagawa (1996), Monte Carlo filter and smoother, doi:10.2307/1390750.
     """
-    return systematic_from(log_weights, _uniform(log_weights, 1, generator), n_samples)
-
-
-def systematic_from(
-    log_weights: Float[Tensor, "B N"], u: Float[Tensor, "B 1"], n_samples: int | None = None
-) -> Int[Tensor, "B n"]:
-    """Return the ancestors of `systematic` for numbers u that were drawn before."""
     n = log_weights.shape[1] if n_samples is None else n_samples
-    return _search(_weights(log_weights), (_steps(log_weights, n) + u) / n)
+    positions = systematic_positions(_uniform(log_weights, 1, generator), n)
+    return _search(_weights(log_weights), positions)
+
+
+def systematic_positions(u: Float[Tensor, "*B 1"], n: int) -> Float[Tensor, "*B n"]:
+    """Return the positions (i + u) / n of `systematic`, below one, for numbers u that were drawn before."""
+    return ((_steps(u, n) + u) / n).clamp_max(BELOW_ONE)
 
 
 def stratified(
@@ -156,15 +155,31 @@ def _steps(log_weights: Tensor, n: int) -> Tensor:
 
 def _search(weights: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> Int[Tensor, "B n"]:
     """Return the particle whose share of the cumulative weights holds each position in [0, 1)."""
-    edges = weights.cumsum(-1)
-    # Divided by its own end, the last edge is exactly 1, and right=True steps over zero weights.
-    edges = edges / edges[:, -1:]
+    edges = _edges(weights)
     dead = ~torch.isfinite(edges[:, -1:])
-    positions = torch.where(dead, 0.0, positions.clamp_max(BELOW_ONE))
+    index = _place(edges, torch.where(dead, 0.0, positions.clamp_max(BELOW_ONE)))
+    steps = torch.arange(index.shape[1], device=index.device).clamp_max(weights.shape[1] - 1)
+    return torch.where(dead, steps, index)
+
+
+def ancestors(weights: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> Int[Tensor, "B n"]:
+    """Return the particle whose share of the cumulative weights holds each position in [0, 1).
+
+    Of weights that are all zero, or hold NaN, it may be any.
+    """
+    return _place(_edges(weights), positions)
+
+
+def _edges(weights: Float[Tensor, "B N"]) -> Float[Tensor, "B N"]:
+    """Return the cumulative shares: divided by its own end, the last one is exactly 1."""
+    edges = weights.cumsum(-1)
+    return edges / edges[:, -1:]
+
+
+def _place(edges: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> Int[Tensor, "B n"]:
+    """Return the first edge above each position; right=True steps over zero weights."""
     index = torch.searchsorted(edges, positions.contiguous(), right=True)
-    last = weights.shape[1] - 1
-    steps = torch.arange(index.shape[1], device=index.device).clamp_max(last)
-    return torch.where(dead, steps, index.clamp_max(last))
+    return index.clamp_max(edges.shape[1] - 1)
 
 
 LEAST_SURVIVORS = 2.0

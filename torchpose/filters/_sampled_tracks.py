@@ -15,16 +15,16 @@ from torchpose.filters._joint_tracks import (
     joined,
     joint_chunks,
     joint_estimate,
-    joint_model,
+    joint_models,
     joint_problems,
     stacked,
 )
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters._outputs import FilterOutput, StepOutput, effective_sample_size, mending
+from torchpose.filters._outputs import FilterOutput, StepOutput, mending
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, uniform
-from torchpose.filters._resampling import systematic, systematic_from
+from torchpose.filters._resampling import ancestors, systematic, systematic_positions
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_predict, mended_update
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -177,23 +177,31 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         return_cov: bool,
     ) -> FilterOutput:
         """Filter some sequences whose random numbers are drawn, as `filter_frame` does."""
-        log_weights = normalise(torch.zeros(first.shape, dtype=self.dtype, device=first.device))
-        equal, least = log_weights, self.resample_threshold * self.n_tracks
-        tracks, steps = JointTracks(self, self.means[first], self.start_cov[first]), []
-        problems = joint_problems(frames)
-        for t, (problem, (drawn, u)) in enumerate(zip(problems, draws, strict=True)):
-            tracks.predict(joint_model(self, t), drawn)
+        equal = normalise(torch.zeros(first.shape, dtype=self.dtype, device=first.device))
+        own = torch.arange(self.n_tracks, device=first.device)
+        tracks, log_weights = JointTracks(self, self.means[first], self.start_cov[first]), equal
+        positions = systematic_positions(torch.stack([u for _, u in draws]), self.n_tracks)
+        moves = joint_models(self, len(draws))
+        steps = []
+        for problem, (drawn, _), places, move in zip(
+            joint_problems(frames), draws, positions, moves, strict=True
+        ):
+            tracks.predict(move, drawn)
             log_likelihood, jitter = tracks.correct(problem)
             joint = log_weights + log_likelihood.to(self.dtype)
-            log_evidence = torch.logsumexp(joint, -1)
-            log_weights = joint - log_evidence[:, None]
-            steps.append(joint_estimate(tracks, log_weights, log_evidence, [jitter], return_cov))
-            needed = effective_sample_size(log_weights) < least
+            log_weights = joint.log_softmax(-1)
+            steps.append(joint_estimate(tracks, log_weights, joint, [jitter], return_cov))
+            weights = log_weights.exp()
+            needed = self._is_degenerate(weights)
             if bool(needed.any()):
-                own = torch.arange(self.n_tracks, device=u.device)
-                tracks.take(torch.where(needed[:, None], systematic_from(log_weights, u), own))
+                parent = ancestors(weights.double(), places)
+                tracks.take(torch.where(needed[:, None], parent, own))
                 log_weights = torch.where(needed[:, None], equal, log_weights)
         return stacked(steps, frames)
+
+    def _is_degenerate(self, weights: Tensor) -> Tensor:
+        """Return whether the effective sample size of normalised weights is below its share of M, [B]."""
+        return weights.square().sum(-1) * (self.resample_threshold * self.n_tracks) > 1
 
     def _draw_components(self, batch: int, generator: Generators) -> Tensor:
         cumulative = self.log_prior.exp().cumsum(0)
@@ -205,7 +213,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return tracks with equal weights for the elements that need it; all of them draw."""
         resampled = systematic(log_weights, generator)
-        needed = effective_sample_size(log_weights) < self.resample_threshold * self.n_tracks
+        needed = self._is_degenerate(log_weights.exp())
         if values_visible() and not bool(needed.any()):
             return log_weights.clone(), mean, cov  # those of the output are the caller's
         own = torch.arange(self.n_tracks, device=mean.device)

@@ -19,15 +19,16 @@ from torchpose._core.module_state import derived
 from torchpose.filters._joint_tracks import JointProblem, JointTracks, joint_model
 from torchpose.filters._mkf import MixtureKalmanFilter
 
-_LOGS = 4  # pivots whose product is within range, and costs one logarithm
+_LOGS = 8  # standard deviations whose product is within range, and costs one logarithm
+_FEW = 48  # tracks, below which the product is faster if they come first
 
 
-class _Candidates(NamedTuple):
+class Candidates(NamedTuple):
     """Holds what all frames share, for the Y = Z (Z + 1) / 2 pairs z >= w, column by column.
 
     Attributes:
-        quadratic: g [Y K, D (D + 1) / 2]. noise: H N_j H^T [Y, K, 1]. rows: H F_j [Z K, D].
-        offset: H b_j [Z, K, 1]. upper: places of d <= e in a flat joint matrix.
+        quadratic: g [D (D + 1) / 2, Y K]. noise: H N_j H^T [Y, K, 1, 1]. rows: -H F_j [D, Z K].
+        offset: H b_j [Z, K, 1, 1]. packed: places of d <= e, then of the mean, in a flat joint matrix.
         row, column: z and w of each pair [Y].
     """
 
@@ -35,7 +36,7 @@ class _Candidates(NamedTuple):
     noise: Tensor
     rows: Tensor
     offset: Tensor
-    upper: Tensor
+    packed: Tensor
     row: Tensor
     column: Tensor
 
@@ -47,38 +48,10 @@ def block_numbers(model: MixtureKalmanFilter) -> tuple[int, int]:
     return blocks * model.n_tracks, blocks * model.dim * (model.dim + 1) // 2
 
 
-def candidate_log_likelihood(
-    model: MixtureKalmanFilter, tracks: JointTracks, problem: JointProblem, time: int
-) -> Float[Tensor, "B M K"]:
-    """Return log N(z | track continued by component); not finite where a block is not positive definite.
+def candidates(model: MixtureKalmanFilter, time: int) -> Candidates:
+    """Return what the candidates of a frame share with those of others, kept after the burn-in."""
 
-    Args:
-        tracks: before the prediction. problem: what is measured. time: number of the frame.
-    """
-    shared = _candidates(model, time)
-    batch, n_tracks, width, _ = tracks.state.shape
-    flat = tracks.state.view(batch * n_tracks, width * width)
-    packed = flat.index_select(1, shared.upper)
-    block = torch.mm(shared.quadratic, packed.T).view(*shared.noise.shape[:2], -1)
-    mean = flat.view(-1, width, width)[:, : model.dim, model.dim]
-    residual = torch.mm(shared.rows, mean.T).view(*shared.offset.shape[:2], -1)
-    # What is measured is the same for all tracks of an element.
-    own = torch.arange(batch, device=flat.device).repeat_interleave(n_tracks)
-    noise = problem.noise[:, 0, shared.row, shared.column].T[:, own]
-    if problem.both is None:
-        block += shared.noise + noise[:, None]
-    else:
-        both = problem.both[:, 0, shared.row, shared.column].T[:, own]
-        block = torch.addcmul(noise[:, None], both[:, None], block + shared.noise)
-    residual = problem.z[:, 0].T[:, own][:, None] - (residual + shared.offset)
-    if problem.both is not None:
-        residual *= problem.mask[:, 0, :, 0].T[:, own][:, None]
-    found = _log_density(block, residual).view(-1, batch, n_tracks).permute(1, 2, 0)
-    return found + problem.log_norm[:, :, None]
-
-
-def _candidates(model: MixtureKalmanFilter, time: int) -> _Candidates:
-    def make() -> _Candidates:
+    def make() -> Candidates:
         dim, n_obs = model.dim, len(model.observed)
         matrix, noise = joint_model(model, time)
         rows, device = matrix[:, :n_obs, :dim].transpose(0, 1), matrix.device
@@ -87,12 +60,14 @@ def _candidates(model: MixtureKalmanFilter, time: int) -> _Candidates:
         left, right = rows[row], rows[column]
         quadratic = left[..., d] * right[..., e]
         quadratic = quadratic + (d != e) * left[..., e] * right[..., d]
-        return _Candidates(
-            quadratic.flatten(0, 1).contiguous(),
-            noise[:, row, column].T[..., None].contiguous(),
-            rows.flatten(0, 1).contiguous(),
-            noise[:, :n_obs, dim].T[..., None].contiguous(),
-            d * matrix.shape[-1] + e,
+        width = matrix.shape[-1]
+        mean = torch.arange(dim, device=device) * width + dim
+        return Candidates(
+            quadratic.flatten(0, 1).T.contiguous(),
+            noise[:, row, column].T[..., None, None].contiguous(),
+            -rows.flatten(0, 1).T.contiguous(),
+            noise[:, :n_obs, dim].T[..., None, None].contiguous(),
+            torch.cat([d * width + e, mean]),
             row,
             column,
         )
@@ -102,34 +77,92 @@ def _candidates(model: MixtureKalmanFilter, time: int) -> _Candidates:
     return derived(model, "candidates", model.sources, make)
 
 
-def _log_density(
-    block: Float[Tensor, "Y K n"], residual: Float[Tensor, "Z K n"]
-) -> Float[Tensor, "K n"]:
-    """Return log N(residual | 0, S) + Z/2 log 2 pi, in place.
+class CandidateRoom:
+    """Weighs the candidates of M tracks of B elements in memory that is used again, with the views of it."""
 
-    S = L D L^T by columns c: with the pivot s and the column l = S_c / s^1/2 below it, the rest of S loses
-    l l^T, and the rest of the residual loses l v with v = residual_c / s^1/2.
+    def __init__(self) -> None:
+        self._size: torch.Size | None = None
 
-    Args:
-        block: the lower triangle of S, column by column.
-    """
-    n_obs, start = len(residual), 0
-    columns = []
-    for size in range(n_obs, 0, -1):
-        columns.append(block[start : start + size])
-        start += size
-    total, pivots = torch.zeros_like(residual[0]), []
-    for c, column in enumerate(columns):
-        pivots.append(column[0].clone())
-        column *= column[:1].rsqrt()
-        white = residual[c].div_(column[0])
-        total.addcmul_(white, white)
-        residual[c + 1 :].addcmul_(column[1:], white, value=-1)
-        for later in range(c + 1, n_obs):
-            columns[later].addcmul_(column[later - c :], column[later - c], value=-1)
-    for first in range(0, n_obs, _LOGS):
-        product = pivots[first]
-        for pivot in pivots[first + 1 : first + _LOGS]:
-            product = product.mul_(pivot)
-        total += product.log_()
-    return total.mul_(-0.5)
+    def _make_room(self, shared: Candidates, state: Tensor) -> None:
+        """Allocate memory for as many tracks as there are, and take the views of every column of S."""
+        self._size = state.shape
+        width, n_obs = state.shape[-1] ** 2, len(shared.offset)
+        first = width * torch.arange(self._size[:2].numel(), device=state.device)[:, None]
+        self._places = (first + shared.packed).flatten()
+        self._block, self._residual = (
+            state.new_empty(*like.shape[:2], *self._size[:2])
+            for like in (shared.noise, shared.offset)
+        )
+        self._white = [*self._residual]
+        columns = [*self._block.split([*range(n_obs, 0, -1)])]
+        self._columns, self._pivots = columns, [column[0] for column in columns]
+        # Of each column of S, what it takes from the residuals and the columns behind it.
+        self._taken = []
+        for c, column in enumerate(columns):
+            below = [(self._residual[c + 1 :], column[1:], self._white[c])]
+            later = [(columns[c + i], column[i:], column[i]) for i in range(1, n_obs - c)]
+            self._taken.append(below + later if later else [])
+
+    def log_likelihood(
+        self, shared: Candidates, tracks: JointTracks, problem: JointProblem
+    ) -> Float[Tensor, "K B M"]:
+        """Return log N(z | track continued by component), not finite where a block is not positive definite.
+
+        Args:
+            shared: of the frame. tracks: before the prediction. problem: what is measured.
+        """
+        if tracks.state.shape != self._size:
+            self._make_room(shared, tracks.state)
+        self._innovate(shared, tracks, problem)
+        # With the pivot s and the column l = S_c / s^1/2, the rest of S = L L^T loses l l^T, and the rest
+        # of the residual loses l v with v = residual_c / s^1/2.
+        columns = zip(self._columns, self._pivots, self._white, self._taken, strict=True)
+        for column, pivot, white, taken in columns:
+            scale = pivot.rsqrt()
+            column.mul_(scale)
+            white.mul_(scale)
+            for rest, below, beside in taken:
+                rest.addcmul_(below, beside, value=-1)
+        found = self._residual.square_().sum(0)
+        return torch.add(problem.log_norm - self._half_log_det(), found, alpha=-0.5)
+
+    def _innovate(self, shared: Candidates, tracks: JointTracks, problem: JointProblem) -> None:
+        """Form the measured blocks of S of all candidates, and the innovations."""
+        pairs = len(shared.quadratic)
+        packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed))
+        _product(packed[:, :pairs], shared.quadratic, self._block)
+        _product(packed[:, pairs:], shared.rows, self._residual)
+        # What is measured is the same for all tracks of an element: [Y or Z, 1, B, 1].
+        noise = _of_elements(problem.noise[:, 0, shared.row, shared.column])
+        z = _of_elements(problem.z[:, 0])
+        if problem.both is None:
+            self._block.add_(noise + shared.noise)
+        else:
+            both = _of_elements(problem.both[:, 0, shared.row, shared.column])
+            self._block.add_(shared.noise).mul_(both).add_(noise)
+        self._residual.add_(z - shared.offset)
+        if problem.both is not None:
+            self._residual.mul_(_of_elements(problem.mask[:, 0, :, 0]))
+
+    def _half_log_det(self) -> Tensor:
+        total = None
+        for first in range(0, len(self._pivots), _LOGS):
+            product = self._pivots[first]
+            for pivot in self._pivots[first + 1 : first + _LOGS]:
+                product = product.mul_(pivot)
+            total = product.log() if total is None else total + product.log()
+        assert total is not None
+        return total
+
+
+def _of_elements(values: Float[Tensor, "B Y"]) -> Float[Tensor, "Y 1 B 1"]:
+    return values.T[:, None, :, None]
+
+
+def _product(left: Float[Tensor, "n R"], right: Float[Tensor, "R C"], out: Tensor) -> None:
+    """Put (left right)^T into memory of C n numbers."""
+    out = out.view(right.shape[1], len(left))
+    if len(left) < _FEW:
+        out.copy_(torch.mm(left, right).T)
+    else:
+        torch.mm(right.T, left.T, out=out)

@@ -1,14 +1,17 @@
 """Run the mixture Kalman filter with split tracks (Smith & Winter, as cited in paper section 3.4)."""
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.value_checks import values_visible
 from torchpose.filters._joint_tracks import (
+    JointModel,
     JointProblem,
     JointTracks,
     joined,
@@ -23,13 +26,23 @@ from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, StepOutput, mending
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, require_state
-from torchpose.filters._split_candidates import block_numbers, candidate_log_likelihood
-from torchpose.filters._weights import estimate_of, normalise
+from torchpose.filters._split_candidates import CandidateRoom, Candidates, block_numbers, candidates
+from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import kalman_correct, kalman_gain, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 _MOST_SHARED = 1 << 22  # numbers, 32 MB, of the product that all frames share
 _RANKS = 1e9  # per nat: log-weights that are nearer are equal
+
+
+class _Frame(NamedTuple):
+    """Holds what one frame measures of some sequences, and how their tracks move into it."""
+
+    time: int
+    measured: Measurements
+    problem: JointProblem
+    move: JointModel
+    shared: Candidates
 
 
 class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
@@ -159,10 +172,9 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
             JointTracks(self, state.mean, state.cov[state.group]),
             state.log_weights,
         )
-        for t, problem in enumerate(joint_problems(frames)):
-            log_weights, step = self._step(
-                tracks, log_weights, problem, frames.frame(t), t, return_cov
-            )
+        room = CandidateRoom()
+        for frame in self._frames(frames, 0):
+            log_weights, step = self._step(tracks, room, log_weights, frame, return_cov)
             steps.append(step)
         return stacked(steps, frames)
 
@@ -172,10 +184,8 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         """Filter one frame by the same operations as whole sequences, so that equal weights fall alike."""
         tracks = JointTracks(self, state.mean, state.cov[state.group])
         frames = frame.as_sequences()
-        (problem,) = joint_problems(frames)
-        log_weights, step = self._step(
-            tracks, state.log_weights, problem, frame, state.time, return_cov
-        )
+        (own,) = self._frames(frames, state.time)
+        log_weights, step = self._step(tracks, CandidateRoom(), state.log_weights, own, return_cov)
         out = stacked([step], frames)
         values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
         group = torch.arange(len(log_weights), device=log_weights.device)
@@ -184,27 +194,45 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         new_state = MKFState(log_weights, mean, cov, group, state.time + 1)
         return new_state, StepOutput(*first)  # type: ignore[arg-type]
 
+    def _frames(self, frames: Measurements, first: int) -> list[_Frame]:
+        """Return the frames of some sequences, of which the first one has number `first`."""
+        problems = joint_problems(frames)
+        times = range(first, first + len(problems))
+        steady = max(self.burn_in, first)
+        move, shared = joint_model(self, steady), candidates(self, steady)
+        return [
+            _Frame(time, frames.frame(t), problem, move, shared)
+            if time >= steady
+            else _Frame(
+                time, frames.frame(t), problem, joint_model(self, time), candidates(self, time)
+            )
+            for t, (time, problem) in enumerate(zip(times, problems, strict=True))
+        ]
+
     def _step(
         self,
         tracks: JointTracks,
+        room: CandidateRoom,
         log_weights: Tensor,
-        problem: JointProblem,
-        frame: Measurements,
-        time: int,
+        frame: _Frame,
         return_cov: bool,
     ) -> tuple[Tensor, StepOutput]:
         """Step the tracks in place, and return their log-weights and the estimate."""
-        log_likelihood = candidate_log_likelihood(self, tracks, problem, time)
-        log_joint = log_weights.to(log_likelihood)[..., None] + self.log_prior + log_likelihood
+        log_likelihood = room.log_likelihood(frame.shared, tracks, frame.problem)
         jitter = None
-        if not bool(torch.isfinite(log_likelihood).all()):  # a block is to be mended, or lost
+        if math.isfinite(log_likelihood.sum()):
+            log_joint = log_likelihood.add_(log_weights).add_(self.log_prior[:, None, None])
+            log_joint = log_joint.permute(1, 2, 0)
+        else:  # a block is to be mended, or lost
             group = torch.arange(len(log_weights), device=log_weights.device)
-            state = MKFState(log_weights, tracks.mean, tracks.cov, group, time)
-            log_joint, jitter = self._candidate_weights(state, state.mean, state.cov, frame)
+            state = MKFState(log_weights, tracks.mean, tracks.cov, group, frame.time)
+            log_joint, jitter = self._candidate_weights(
+                state, state.mean, state.cov, frame.measured
+            )
         log_weights, log_evidence, parent, component = self._select(log_joint)
         tracks.take(parent)
-        tracks.predict(joint_model(self, time), component)
-        jitters = [jitter, tracks.correct(problem)[1]]
+        tracks.predict(frame.move, component)
+        jitters = [jitter, tracks.correct(frame.problem)[1]]
         log_evidence = log_evidence.to(self.dtype)
         return log_weights, joint_estimate(tracks, log_weights, log_evidence, jitters, return_cov)
 
@@ -218,14 +246,14 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         log_evidence = torch.logsumexp(flat, -1)
         # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
         spare = max(0, self.n_tracks - flat.shape[1])
-        padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf)
-        ranks = (padded * _RANKS).round()
-        chosen = ranks.sort(dim=1, descending=True, stable=True).indices[:, : self.n_tracks]
-        kept = padded.gather(1, chosen)
-        chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
+        padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf) if spare else flat
+        chosen = _first_of_largest((padded * _RANKS).round_(), self.n_tracks)
+        log_weights = padded.gather(1, chosen).log_softmax(-1).to(self.dtype)
+        if spare:
+            chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
         n_components = self.means.shape[0]
-        log_weights = normalise(kept).to(self.dtype)
-        return log_weights, log_evidence, chosen // n_components, chosen % n_components
+        parent = chosen.div(n_components, rounding_mode="floor")
+        return log_weights, log_evidence, parent, chosen.sub(parent, alpha=n_components)
 
     def _candidate_weights(
         self, state: MKFState, mean: Tensor, cov: Tensor, frame: Measurements
@@ -265,3 +293,11 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         z = frame.z[:, None].to(mean.dtype)
         mean, _ = kalman_correct(mean, z, gain, self.observed, mask)
         return mean, cov, gain.jitter
+
+
+def _first_of_largest(ranks: Float[Tensor, "B N"], count: int) -> Int[Tensor, "B n"]:
+    """Return the places of the largest numbers in falling order, of equal ones the first places."""
+    largest, places = ranks.topk(min(count + 1, ranks.shape[1]), 1)
+    if bool((largest[:, :-1] > largest[:, 1:]).all()):
+        return places[:, :count]
+    return ranks.sort(dim=1, descending=True, stable=True).indices[:, :count]
