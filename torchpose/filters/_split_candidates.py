@@ -9,6 +9,7 @@ one product of the symmetric parts of all P with g, which is made once. The smal
 column by column, each step over all candidates at once.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -29,7 +30,6 @@ class Candidates(NamedTuple):
     Attributes:
         quadratic: g [D (D + 1) / 2, Y K]. noise: H N_j H^T [Y, K, 1, 1]. rows: -H F_j [D, Z K].
         offset: H b_j [Z, K, 1, 1]. packed: places of d <= e, then of the mean, in a flat joint matrix.
-        row, column: z and w of each pair [Y].
     """
 
     quadratic: Tensor
@@ -37,8 +37,20 @@ class Candidates(NamedTuple):
     rows: Tensor
     offset: Tensor
     packed: Tensor
-    row: Tensor
-    column: Tensor
+
+
+class CandidateProblem(NamedTuple):
+    """Holds what B elements measure in one frame, the same for all candidates of an element.
+
+    Attributes:
+        z, mask: [Z, 1, B, 1]. noise, both: of the pairs [Y, 1, B, 1]. log_norm: [B, 1]. As in `JointProblem`.
+    """
+
+    z: Tensor
+    noise: Tensor
+    both: Tensor | None
+    mask: Tensor
+    log_norm: Tensor
 
 
 def block_numbers(model: MixtureKalmanFilter) -> tuple[int, int]:
@@ -55,7 +67,7 @@ def candidates(model: MixtureKalmanFilter, time: int) -> Candidates:
         dim, n_obs = model.dim, len(model.observed)
         matrix, noise = joint_model(model, time)
         rows, device = matrix[:, :n_obs, :dim].transpose(0, 1), matrix.device
-        column, row = torch.triu_indices(n_obs, n_obs, device=device)
+        row, column = _pairs(n_obs, device)
         d, e = torch.triu_indices(dim, dim, device=device)
         left, right = rows[row], rows[column]
         quadratic = left[..., d] * right[..., e]
@@ -68,13 +80,38 @@ def candidates(model: MixtureKalmanFilter, time: int) -> Candidates:
             -rows.flatten(0, 1).T.contiguous(),
             noise[:, :n_obs, dim].T[..., None, None].contiguous(),
             torch.cat([d * width + e, mean]),
-            row,
-            column,
         )
 
     if time < model.burn_in:
         return make()
     return derived(model, "candidates", model.sources, make)
+
+
+def candidate_problems(problems: Sequence[JointProblem]) -> list[CandidateProblem]:
+    """Return what is measured in every frame, for `CandidateRoom.log_likelihood`."""
+    rows = _pairs(problems[0].z.shape[-1], problems[0].z.device)
+
+    def of_pairs(values: list[Tensor]) -> tuple[Tensor, ...]:
+        return _of_elements(torch.stack(values)[:, :, 0, *rows])
+
+    noise = of_pairs([problem.noise for problem in problems])
+    gaps = [problem.both for problem in problems if problem.both is not None]
+    both = of_pairs(gaps) if gaps else [None] * len(problems)
+    z = _of_elements(torch.stack([problem.z for problem in problems])[:, :, 0])
+    mask = _of_elements(torch.stack([problem.mask for problem in problems])[:, :, 0, :, 0])
+    norms = [problem.log_norm for problem in problems]
+    return [*map(CandidateProblem, z, noise, both, mask, norms)]
+
+
+def _of_elements(values: Float[Tensor, "T B Y"]) -> tuple[Float[Tensor, "Y 1 B 1"], ...]:
+    """Return the values of each frame, beside candidates."""
+    return values.mT[:, :, None, :, None].unbind()
+
+
+def _pairs(n_obs: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return z and w of the pairs z >= w, column by column."""
+    column, row = torch.triu_indices(n_obs, n_obs, device=device)
+    return row, column
 
 
 class CandidateRoom:
@@ -104,7 +141,7 @@ class CandidateRoom:
             self._taken.append(below + later if later else [])
 
     def log_likelihood(
-        self, shared: Candidates, tracks: JointTracks, problem: JointProblem
+        self, shared: Candidates, tracks: JointTracks, problem: CandidateProblem
     ) -> Float[Tensor, "K B M"]:
         """Return log N(z | track continued by component), not finite where a block is not positive definite.
 
@@ -126,23 +163,18 @@ class CandidateRoom:
         found = self._residual.square_().sum(0)
         return torch.add(problem.log_norm - self._half_log_det(), found, alpha=-0.5)
 
-    def _innovate(self, shared: Candidates, tracks: JointTracks, problem: JointProblem) -> None:
+    def _innovate(self, shared: Candidates, tracks: JointTracks, problem: CandidateProblem) -> None:
         """Form the measured blocks of S of all candidates, and the innovations."""
         pairs = len(shared.quadratic)
         packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed))
         _product(packed[:, :pairs], shared.quadratic, self._block)
         _product(packed[:, pairs:], shared.rows, self._residual)
-        # What is measured is the same for all tracks of an element: [Y or Z, 1, B, 1].
-        noise = _of_elements(problem.noise[:, 0, shared.row, shared.column])
-        z = _of_elements(problem.z[:, 0])
         if problem.both is None:
-            self._block.add_(noise + shared.noise)
+            self._block.add_(problem.noise + shared.noise)
+            self._residual.add_(problem.z - shared.offset)
         else:
-            both = _of_elements(problem.both[:, 0, shared.row, shared.column])
-            self._block.add_(shared.noise).mul_(both).add_(noise)
-        self._residual.add_(z - shared.offset)
-        if problem.both is not None:
-            self._residual.mul_(_of_elements(problem.mask[:, 0, :, 0]))
+            self._block.add_(shared.noise).mul_(problem.both).add_(problem.noise)
+            self._residual.add_(problem.z - shared.offset).mul_(problem.mask)
 
     def _half_log_det(self) -> Tensor:
         total = None
@@ -153,10 +185,6 @@ class CandidateRoom:
             total = product.log() if total is None else total + product.log()
         assert total is not None
         return total
-
-
-def _of_elements(values: Float[Tensor, "B Y"]) -> Float[Tensor, "Y 1 B 1"]:
-    return values.T[:, None, :, None]
 
 
 def _product(left: Float[Tensor, "n R"], right: Float[Tensor, "R C"], out: Tensor) -> None:

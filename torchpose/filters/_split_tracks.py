@@ -26,7 +26,14 @@ from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, StepOutput, mending
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, require_state
-from torchpose.filters._split_candidates import CandidateRoom, Candidates, block_numbers, candidates
+from torchpose.filters._split_candidates import (
+    CandidateProblem,
+    CandidateRoom,
+    Candidates,
+    block_numbers,
+    candidate_problems,
+    candidates,
+)
 from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import kalman_correct, kalman_gain, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -36,11 +43,12 @@ _RANKS = 1e9  # per nat: log-weights that are nearer are equal
 
 
 class _Frame(NamedTuple):
-    """Holds what one frame measures of some sequences, and how their tracks move into it."""
+    """Holds what one frame measures of some sequences, and how tracks and candidates move into it."""
 
     time: int
     measured: Measurements
     problem: JointProblem
+    own: CandidateProblem
     move: JointModel
     shared: Candidates
 
@@ -199,15 +207,14 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         problems = joint_problems(frames)
         times = range(first, first + len(problems))
         steady = max(self.burn_in, first)
-        move, shared = joint_model(self, steady), candidates(self, steady)
-        return [
-            _Frame(time, frames.frame(t), problem, move, shared)
-            if time >= steady
-            else _Frame(
-                time, frames.frame(t), problem, joint_model(self, time), candidates(self, time)
-            )
-            for t, (time, problem) in enumerate(zip(times, problems, strict=True))
+        kept = joint_model(self, steady), candidates(self, steady)
+        models = [
+            kept if time >= steady else (joint_model(self, time), candidates(self, time))
+            for time in times
         ]
+        measured = [frames.frame(t) for t in range(len(times))]
+        rows = zip(times, measured, problems, candidate_problems(problems), models, strict=True)
+        return [_Frame(*row, *model) for *row, model in rows]
 
     def _step(
         self,
@@ -218,7 +225,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         return_cov: bool,
     ) -> tuple[Tensor, StepOutput]:
         """Step the tracks in place, and return their log-weights and the estimate."""
-        log_likelihood = room.log_likelihood(frame.shared, tracks, frame.problem)
+        log_likelihood = room.log_likelihood(frame.shared, tracks, frame.own)
         jitter = None
         if math.isfinite(log_likelihood.sum()):
             log_joint = log_likelihood.add_(log_weights).add_(self.log_prior[:, None, None])
