@@ -304,7 +304,8 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
 
 def _first_of_largest(ranks: Float[Tensor, "B N"], count: int) -> Int[Tensor, "B n"]:
     """Return the places of the largest numbers in falling order, of equal ones the first places."""
-    largest, places = ranks.topk(min(count + 1, ranks.shape[1]), 1)
-    if bool((largest[:, :-1] > largest[:, 1:]).all()):
-        return places[:, :count]
+    if values_visible():
+        largest, places = ranks.topk(min(count + 1, ranks.shape[1]), 1)
+        if bool((largest[:, :-1] > largest[:, 1:]).all()):  # none is equal to another, nor NaN
+            return places[:, :count]
     return ranks.sort(dim=1, descending=True, stable=True).indices[:, :count]
