@@ -33,8 +33,8 @@ from torchpose.filters._outputs import (
 from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
-TRACK_NUMBERS = 1 << 17
-"""Numbers in the tracks that are stepped at a time: 1 MB, which stay in the cache beside other memory."""
+_TRACK_NUMBERS = 1 << 17  # in the tracks that are stepped at a time: 1 MB, which stay in the cache
+_ON_DEVICE = 1 << 18  # where small operations wait for each other
 _LOGS = 16  # standard deviations whose product is within range, and costs one logarithm
 
 
@@ -68,7 +68,8 @@ def joint_chunks(model: MixtureKalmanFilter, batch: int, numbers: int = 0) -> li
     """
     width = model.dim + spare_columns(model.dim)
     each = max(model.n_tracks * width**2, numbers)
-    count = max(1, min(batch, round(batch * each / TRACK_NUMBERS)))
+    most = _TRACK_NUMBERS if model.observed.device.type == "cpu" else _ON_DEVICE
+    count = max(1, min(batch, round(batch * each / most)))
     edges = [round(batch * i / count) for i in range(count + 1)]
     return [slice(*pair) for pair in itertools.pairwise(edges)]
 

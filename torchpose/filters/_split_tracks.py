@@ -214,7 +214,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         ]
         measured = [frames.frame(t) for t in range(len(times))]
         rows = zip(times, measured, problems, candidate_problems(problems), models, strict=True)
-        return [_Frame(*row, *model) for *row, model in rows]
+        return [_Frame(time, z, problem, own, *model) for time, z, problem, own, model in rows]
 
     def _step(
         self,
