@@ -1,5 +1,6 @@
 """Run the mixture Kalman filter with sampled tracks, whose indicators are drawn (BL 43-48)."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -201,7 +202,8 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
 
     def _is_degenerate(self, weights: Tensor) -> Tensor:
         """Return whether the effective sample size of normalised weights is below its share of M, [B]."""
-        return weights.square().sum(-1) * (self.resample_threshold * self.n_tracks) > 1
+        least = self.resample_threshold * self.n_tracks
+        return torch.linalg.vecdot(weights, weights) > (1 / least if least else math.inf)
 
     def _draw_components(self, batch: int, generator: Generators) -> Tensor:
         cumulative = self.log_prior.exp().cumsum(0)
