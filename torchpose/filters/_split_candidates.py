@@ -21,7 +21,6 @@ from torchpose.filters._joint_tracks import JointProblem, JointTracks, joint_mod
 from torchpose.filters._mkf import MixtureKalmanFilter
 
 _LOGS = 8  # standard deviations whose product is within range, and costs one logarithm
-_FEW = 48  # tracks, below which the product is faster if they come first
 
 
 class Candidates(NamedTuple):
@@ -188,9 +187,5 @@ class CandidateRoom:
 
 
 def _product(left: Float[Tensor, "n R"], right: Float[Tensor, "R C"], out: Tensor) -> None:
-    """Put (left right)^T into memory of C n numbers."""
-    out = out.view(right.shape[1], len(left))
-    if len(left) < _FEW:
-        out.copy_(torch.mm(left, right).T)
-    else:
-        torch.mm(right.T, left.T, out=out)
+    """Put (left right)^T into memory of C n numbers; the product in this order takes up to half the time."""
+    out.view(right.shape[1], len(left)).copy_(torch.mm(left, right).T)
