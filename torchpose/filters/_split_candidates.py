@@ -23,7 +23,7 @@ from torchpose.filters._mkf import MixtureKalmanFilter
 _LOGS = 8  # standard deviations whose product is within range, and costs one logarithm
 
 
-class Candidates(NamedTuple):
+class SharedCandidates(NamedTuple):
     """Holds what all frames share, for the Y = Z (Z + 1) / 2 pairs z >= w, column by column.
 
     Attributes:
@@ -59,10 +59,10 @@ def block_numbers(model: MixtureKalmanFilter) -> tuple[int, int]:
     return blocks * model.n_tracks, blocks * model.dim * (model.dim + 1) // 2
 
 
-def candidates(model: MixtureKalmanFilter, time: int) -> Candidates:
+def candidates(model: MixtureKalmanFilter, time: int) -> SharedCandidates:
     """Return what the candidates of a frame share with those of others, kept after the burn-in."""
 
-    def make() -> Candidates:
+    def make() -> SharedCandidates:
         dim, n_obs = model.dim, len(model.observed)
         matrix, noise = joint_model(model, time)
         rows, device = matrix[:, :n_obs, :dim].transpose(0, 1), matrix.device
@@ -73,7 +73,7 @@ def candidates(model: MixtureKalmanFilter, time: int) -> Candidates:
         quadratic = quadratic + (d != e) * left[..., e] * right[..., d]
         width = matrix.shape[-1]
         mean = torch.arange(dim, device=device) * width + dim
-        return Candidates(
+        return SharedCandidates(
             quadratic.flatten(0, 1).T.contiguous(),
             noise[:, row, column].T[..., None, None].contiguous(),
             -rows.flatten(0, 1).T.contiguous(),
@@ -119,7 +119,7 @@ class CandidateRoom:
     def __init__(self) -> None:
         self._size: torch.Size | None = None
 
-    def _make_room(self, shared: Candidates, state: Tensor) -> None:
+    def _make_room(self, shared: SharedCandidates, state: Tensor) -> None:
         """Allocate memory for as many tracks as there are, and take the views of every column of S."""
         self._size = state.shape
         width, n_obs = state.shape[-1] ** 2, len(shared.offset)
@@ -140,7 +140,7 @@ class CandidateRoom:
             self._taken.append(below + later if later else [])
 
     def log_likelihood(
-        self, shared: Candidates, tracks: JointTracks, problem: CandidateProblem
+        self, shared: SharedCandidates, tracks: JointTracks, problem: CandidateProblem
     ) -> Float[Tensor, "K B M"]:
         """Return log N(z | track continued by component), not finite where a block is not positive definite.
 
@@ -162,7 +162,9 @@ class CandidateRoom:
         found = self._residual.square_().sum(0)
         return torch.add(problem.log_norm - self._half_log_det(), found, alpha=-0.5)
 
-    def _innovate(self, shared: Candidates, tracks: JointTracks, problem: CandidateProblem) -> None:
+    def _innovate(
+        self, shared: SharedCandidates, tracks: JointTracks, problem: CandidateProblem
+    ) -> None:
         """Form the measured blocks of S of all candidates, and the innovations."""
         pairs = len(shared.quadratic)
         packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed))

@@ -29,7 +29,7 @@ from torchpose.filters._recursive_filter import Generators, require_state
 from torchpose.filters._split_candidates import (
     CandidateProblem,
     CandidateRoom,
-    Candidates,
+    SharedCandidates,
     block_numbers,
     candidate_problems,
     candidates,
@@ -42,7 +42,7 @@ _MOST_SHARED = 1 << 22  # numbers, 32 MB, of the product that all frames share
 _RANKS = 1e9  # per nat: log-weights that are nearer are equal
 
 
-class _Frame(NamedTuple):
+class _SplitFrame(NamedTuple):
     """Holds what one frame measures of some sequences, and how tracks and candidates move into it."""
 
     time: int
@@ -50,7 +50,7 @@ class _Frame(NamedTuple):
     problem: JointProblem
     own: CandidateProblem
     move: JointModel
-    shared: Candidates
+    shared: SharedCandidates
 
 
 class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
@@ -202,7 +202,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         new_state = MKFState(log_weights, mean, cov, group, state.time + 1)
         return new_state, StepOutput(*first)  # type: ignore[arg-type]
 
-    def _frames(self, frames: Measurements, first: int) -> list[_Frame]:
+    def _frames(self, frames: Measurements, first: int) -> list[_SplitFrame]:
         """Return the frames of some sequences, of which the first one has number `first`."""
         problems = joint_problems(frames)
         times = range(first, first + len(problems))
@@ -214,14 +214,14 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         ]
         measured = [frames.frame(t) for t in range(len(times))]
         rows = zip(times, measured, problems, candidate_problems(problems), models, strict=True)
-        return [_Frame(time, z, problem, own, *model) for time, z, problem, own, model in rows]
+        return [_SplitFrame(time, z, problem, own, *model) for time, z, problem, own, model in rows]
 
     def _step(
         self,
         tracks: JointTracks,
         room: CandidateRoom,
         log_weights: Tensor,
-        frame: _Frame,
+        frame: _SplitFrame,
         return_cov: bool,
     ) -> tuple[Tensor, StepOutput]:
         """Step the tracks in place, and return their log-weights and the estimate."""
