@@ -19,6 +19,8 @@ MOST_CONFIDENCE = 2.0
 """Of a keypoint: peaks of heat maps may exceed 1, and count as 1; more is a score in percent."""
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second
+_LARGEST_SHARE = 2.0  # of the image; joints may lie outside of it
+_SEVERAL = 3  # keypoints that tell whether most are shares
 
 
 def refuse_export(what: str, instead: str) -> None:
@@ -85,6 +87,15 @@ def check_floating(name: str, tensor: Any) -> None:
         )
 
 
+def refuse_half(name: str, pixels: Tensor | None) -> None:
+    """Raise `InputError` for pixels in half precision: above 512, bfloat16 has every fourth one alone."""
+    if pixels is not None and pixels.dtype in (torch.float16, torch.bfloat16):
+        raise InputError(
+            f"{name} must be torch.float32 or torch.float64, got {pixels.dtype}, which does not hold "
+            "pixels; compute them with .float() in the network, outside autocast"
+        )
+
+
 def check_tensors(**values: object) -> None:
     """Raise `InputError` for arrays and lists in place of tensors, by their names; None may pass."""
     for name, value in values.items():
@@ -99,6 +110,26 @@ def check_real(name: str, values: Any) -> None:
     dtype = getattr(values, "dtype", None)
     if getattr(dtype, "is_complex", False) or getattr(dtype, "kind", "") == "c":
         raise InputError(f"{name} must be real, got {dtype}")
+
+
+def check_pixels(name: str, points: Tensor, there: Tensor) -> None:
+    """Raise `InputError` for shares of the image in place of pixels: nobody is so small that most fit.
+
+    Points at exactly (0, 0) are what some detectors write where they found nothing, and do not count.
+
+    Args:
+        name: the name of the points, for the message. points: [*batch, 2]. there: which are meant, [*batch].
+    """
+    if not values_visible():
+        return
+    given = points.detach()[there & (points != 0).any(-1)]
+    shares = (given.abs() <= _LARGEST_SHARE).all(-1)
+    if len(given) >= _SEVERAL and 2 * int(shares.sum()) > len(given):
+        raise InputError(
+            f"{name} must be in pixels, got most of them between {float(given[shares].min()):.3g} and "
+            f"{float(given[shares].max()):.3g}; multiply those between 0 and 1 by the width and height of "
+            "the image"
+        )
 
 
 def check_rgb(name: str, image: Any, empty: bool = True) -> None:

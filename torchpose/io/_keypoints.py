@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import MOST_CONFIDENCE, check_rate
+from torchpose._core.checks import MOST_CONFIDENCE, check_pixels, check_rate
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose.camera._projection import check_intrinsics
@@ -27,12 +27,10 @@ from torchpose.io._formats.keypoint_files import (
 from torchpose.io._formats.openpose import read_openpose
 from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
-from torchpose.skeleton._upper_body import NECK_KINDS
+from torchpose.skeleton._upper_body import NECK_KINDS, neck_of_detectors
 
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
-_NORMALISED = 2.0  # no more are shares of the image, in which joints may lie outside
-_SEVERAL = 6  # keypoints
 
 
 @dataclass
@@ -139,7 +137,8 @@ def _read(path: Path) -> RawKeypoints:
     if path.suffix.lower() not in readers:
         raise FileFormatError(
             f"{path}: expected keypoints as .npz, .csv or a folder of OpenPose JSON files, got "
-            f"{path.suffix or 'no suffix'}"
+            f"{path.suffix or 'no suffix'}; write those of other programs as a .csv with the columns "
+            "frame,name,x,y,confidence, or an .npz (docs/file-formats.md, Other programs)"
         )
     return readers[path.suffix.lower()](path)
 
@@ -225,7 +224,10 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         confidence = np.where(missing, 0.0, confidence)
     if missing.all():
         raise InputError(f"{path}: no keypoint is measured in any of {len(points)} frames")
-    _check_pixels(path, points[~missing])
+    try:
+        check_pixels("keypoints", torch.from_numpy(points), torch.from_numpy(~missing))
+    except InputError as error:
+        raise FileFormatError(f"{path}: {error}") from error
     try:
         fps = None if raw.fps is None else check_rate("fps", raw.fps)
     except InputError as error:
@@ -239,7 +241,7 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
         None if raw.confidence is None else torch.from_numpy(confidence), fps,
         _check_matrix(path, raw.K), _check_size(path, raw.image_size),
-        raw.neck or (None if skeleton is None else skeleton.neck), path,
+        raw.neck or (neck_of_detectors(names) if skeleton is None else skeleton.neck), path,
         notes=_note_of_filled(int(filled.sum())),
         n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
         first_frame=raw.first_frame,
@@ -260,15 +262,6 @@ def _with_joints(data: Keypoints) -> Keypoints:
     return replace(
         data, keypoints=points, confidence=confidence, names=names, neck="neck", notes=notes
     )
-
-
-def _check_pixels(path: Path, points: np.ndarray) -> None:
-    """Refuse keypoints [N, 2] that are no pixels, such as those between 0 and 1."""
-    if len(points) >= _SEVERAL and np.abs(points).max() <= _NORMALISED:
-        raise FileFormatError(
-            f"{path}: keypoints must be in pixels, got all of them between {points.min():.3g} and "
-            f"{points.max():.3g}; multiply those between 0 and 1 by the width and height of the image"
-        )
 
 
 def _note_of_filled(count: int) -> tuple[str, ...]:

@@ -12,8 +12,10 @@ from torchpose._core.checks import (
     check_covariance,
     check_finite,
     check_floating,
+    check_pixels,
     check_shape,
     check_tensors,
+    refuse_half,
 )
 from torchpose._core.module_state import derived, index_tensor
 from torchpose.camera._pinhole import PinholeCamera
@@ -288,10 +290,12 @@ def in_prior_pixels(
         measurement_cov: R without `covariance`, in the prior's pixels.
 
     Raises:
-        ShapeError, InputError: as `measured_keypoints`. CovarianceError: a covariance that is none.
+        ShapeError, InputError: as `measured_keypoints`, or most keypoints are shares of the image.
+        CovarianceError: a covariance that is none.
     """
     to_prior, _ = kept_pixel_maps(camera, prior)
     there = measured_keypoints(keypoints, confidence, mask)
+    check_pixels("keypoints", keypoints, there)
     if covariance is not None:
         known = known_covariances(covariance, there, picked.indices, keypoints)
         covariance = to_prior.covariances(known)
@@ -326,9 +330,10 @@ def check_sequences(keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
     """Return keypoints of whole sequences after checks of type and shape.
 
     Raises:
-        InputError: integers, no sequence or no frame. ShapeError: another shape.
+        InputError: integers, half precision, no sequence or no frame. ShapeError: another shape.
     """
     check_floating("keypoints", keypoints)
+    refuse_half("keypoints", keypoints)
     check_shape("keypoints", keypoints, ["B", "T", "J", 2])
     if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
         raise InputError(

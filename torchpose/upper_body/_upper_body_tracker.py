@@ -14,6 +14,7 @@ from torchpose._core.checks import (
     check_shape,
     check_tensors,
     refuse_export,
+    refuse_half,
 )
 from torchpose._core.module_state import (
     WideModule,
@@ -278,8 +279,9 @@ class UpperBodyTracker(WideModule):
             `PoseTrack`.
 
         Raises:
-            ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
-            for longer than `max_gap`. SkeletonError: unknown names.
+            ShapeError, InputError: wrong shapes, infinite values, half precision, shares of the image in
+            place of pixels, nothing measured in a sequence or for longer than `max_gap`.
+            SkeletonError: unknown names.
         """
         refuse_export(*_NO_EXPORT)
         with one_run(self.measurement_cov.device):
@@ -409,6 +411,7 @@ class UpperBodyTracker(WideModule):
         refuse_export(*_NO_EXPORT)
         check_stream(state)
         check_floating("keypoints", keypoints)
+        refuse_half("keypoints", keypoints)
         check_shape("keypoints", keypoints, [len(state.unseen), "T", state.n_keypoints, 2])
         if keypoints.shape[1] == 0:
             raise InputError("keypoints must hold at least one frame, got none")

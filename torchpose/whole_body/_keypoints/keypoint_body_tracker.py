@@ -14,9 +14,11 @@ from torchpose._core.checks import (
     MOST_CONFIDENCE,
     check_choice,
     check_height,
+    check_pixels,
     check_positive,
     check_shape,
     number_of,
+    refuse_half,
 )
 from torchpose.body._feet import ANKLES, FEET, foot_points
 from torchpose.body._kinematics import Body
@@ -345,6 +347,7 @@ class KeypointBodyTracker(nn.Module):
         covariance: Tensor | None,
     ) -> tuple[KeypointFrame, KeypointFrame | None]:
         """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them."""
+        refuse_half("keypoints", keypoints)
         names = _names_of(keypoints, names)
         shape = keypoints.shape[:-1]
         for name, value in (("confidence", confidence), ("covariance", covariance)):
@@ -394,10 +397,11 @@ class KeypointBodyTracker(nn.Module):
         )  # fmt: skip
 
     def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
-        """Refuse keypoints most of which lie far outside an image: they are of another size."""
+        """Refuse shares of an image, and keypoints most of which lie far outside it: of another size."""
         sides = [(torch.inf, torch.inf) if size is None else size[::-1] for size in self.rig.sizes]
         side = torch.tensor(sides).to(pixels)[:, None]
         there = pixels.isfinite().all(-1)
+        check_pixels("keypoints", pixels, there)
         outside = ((pixels < -side / 2) | (pixels > 1.5 * side)).any(-1) & there
         wrong, every = (value.movedim(-2, 0).flatten(1).sum(1) for value in (outside, there))
         most = (2 * wrong > every).tolist()
