@@ -122,6 +122,22 @@ def _find_upper_body(names: tuple[str, ...], nose_as_head: bool) -> UpperBodyMap
     return UpperBodyMap(indices, missing, neck, hand, head)
 
 
+def neck_of_detectors(names: Sequence[str]) -> str | None:
+    """Return the kind of a neck that stands beside a face and without a head, or None.
+
+    Detectors such as OpenPose, whose neck is the middle of the shoulders, mark faces in place of heads.
+
+    Raises:
+        SkeletonError: an unknown name, or two names of one joint.
+
+    >>> neck_of_detectors(["Nose", "Neck", "LWrist"]), neck_of_detectors(["Head", "Neck", "LWrist"])
+    ('mid-shoulder', None)
+    """
+    known = set(canonical_names(names))
+    face = {"nose", "eye_left", "eye_right", "ear_left", "ear_right"} & known
+    return "mid-shoulder" if face and "neck" in known and "head" not in known else None
+
+
 def _hand_kind(canonical: Sequence[str]) -> str | None:
     sides = {kind: {s for s in ("left", "right") if f"{kind}_{s}" in canonical}
              for kind in ("hand", "wrist")}  # fmt: skip

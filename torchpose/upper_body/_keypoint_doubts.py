@@ -1,8 +1,10 @@
 """Say what is doubtful about the keypoints of a file, and refuse those of images of another size."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchpose.errors import CameraError
 from torchpose.io._keypoints import Keypoints, said_of_crowd
@@ -10,7 +12,10 @@ from torchpose.skeleton._joint_sets import canonical_names
 
 _UPPER = ("head", "nose", "neck")
 _LOWER = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right", "hip_left", "hip_right")
-_TURNED = 0.8  # share of the frames in which what is above should not be below
+_SURE = 0.3  # confidence
+_MOST = 0.8  # share of the frames in which a doubt has to hold
+_ALONG = 0.7  # of the way from the trunk to the head: the cosine of 45 degrees
+_LOW_NECK = 0.1  # of the way from the middle of the shoulders to the head; Kinect's neck is at 0.37
 
 
 def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> None:
@@ -38,26 +43,99 @@ def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> N
         )
 
 
-def doubts_about(keypoints: Keypoints) -> Iterator[str]:
-    """Yield a note on each doubt about the keypoints of a file."""
+def doubts_about(
+    keypoints: Keypoints, neck_is_told: bool, up: Tensor | None = None
+) -> Iterator[str]:
+    """Yield a note on each doubt about the keypoints of a file.
+
+    Args:
+        keypoints: of a file. neck_is_told: whether their neck is known to be the prior's, or not to be.
+        up: the direction that points up, camera axes, [3]; by default the camera is about level.
+    """
     if crowd := said_of_crowd(keypoints.n_people):
         yield crowd
     if keypoints.first_frame:
         yield f"frame 0 is number {keypoints.first_frame} of the file"
-    if _upside_down(keypoints):
+    joints = _Joints(keypoints)
+    rise, aside = _directions(joints, up)
+    if _mostly(rise, -_ALONG):
         yield (
             "head and neck lie below shoulders and elbows in most frames: rows of pixels count downwards, so "
             "keypoints that count upwards have to be turned over"
         )
+    if _mostly(-aside.abs(), -_ALONG):
+        yield (
+            "head and neck lie beside shoulders and hips in most frames: unless the person lies, v was given "
+            "before u, or the video lies on its side (--roll 90 or -90)"
+        )
+    if _mostly(_facing(joints, up), 0.0):
+        yield (
+            "the left shoulder is to the left of the right one in most frames, as from behind, and the nose "
+            "is seen: left and right are the person's own; exchange them if the person faces the camera"
+        )
+    if not neck_is_told and _between_shoulders(joints):
+        yield (
+            "the neck lies between the shoulders in most frames, and is taken for the prior's, which is 9 to "
+            "13 cm above: --neck mid-shoulder says that it is their middle"
+        )
 
 
-def _upside_down(keypoints: Keypoints) -> bool:
-    """Return whether what is above in people is below in most frames."""
-    names = canonical_names(keypoints.names)
-    above, below = ([names.index(n) for n in group if n in names] for group in (_UPPER, _LOWER))
-    if not above or not below:
-        return False
-    rows = keypoints.keypoints[..., 1]
-    gaps = rows[:, above].nanmean(1) - rows[:, below].nanmean(1)
-    known = gaps.isfinite()
-    return bool(known.any()) and float((gaps[known] > 0).double().mean()) > _TURNED
+class _Joints:
+    """Pixels of the joints of a file, by their canonical names."""
+
+    def __init__(self, keypoints: Keypoints) -> None:
+        self._places = {name: i for i, name in enumerate(canonical_names(keypoints.names))}
+        doubtful = torch.zeros(1, dtype=torch.bool)
+        if keypoints.confidence is not None:
+            doubtful = keypoints.confidence[..., None] < _SURE
+        self._pixels = keypoints.keypoints.masked_fill(doubtful, torch.nan)
+
+    def __call__(self, name: str) -> Float[Tensor, "T 2"]:
+        """Return the pixels of a joint, NaN where it is missing or not sure."""
+        place = self._places.get(name)
+        if place is None:
+            return torch.full_like(self._pixels[:, 0], torch.nan)
+        return self._pixels[:, place]
+
+    def mean(self, names: Sequence[str]) -> Float[Tensor, "T 2"]:
+        """Return the mean of the joints that are there in each frame."""
+        return torch.stack([self(name) for name in names]).nanmean(0)
+
+
+def _directions(
+    joints: _Joints, up: Tensor | None
+) -> tuple[Float[Tensor, " T"], Float[Tensor, " T"]]:
+    """Return how much of the way from the trunk to the head is up, and how much aside, -1 to 1."""
+    way = joints.mean(_UPPER) - joints.mean(_LOWER)
+    rise, aside = (way @ axis for axis in _axes(up, way))
+    length = torch.linalg.vector_norm(way, dim=-1)
+    return rise / length, aside / length
+
+
+def _axes(up: Tensor | None, like: Tensor) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
+    """Return up and the right of the image, upright."""
+    rise = like.new_tensor([0.0, -1.0]) if up is None else up[:2].to(like)
+    rise = rise / torch.linalg.vector_norm(rise)
+    return rise, torch.stack([-rise[1], rise[0]])
+
+
+def _facing(joints: _Joints, up: Tensor | None) -> Float[Tensor, " T"]:
+    """Return by how much the left shoulder is on the right of the other, NaN where no face is seen."""
+    across = joints("shoulder_left") - joints("shoulder_right")
+    aside = across @ _axes(up, across)[1]
+    return torch.where(joints("nose").isfinite().all(-1), aside, torch.nan)
+
+
+def _between_shoulders(joints: _Joints) -> bool:
+    """Return whether the neck is the middle of the shoulders, and the head is above."""
+    middle = joints.mean(["shoulder_left", "shoulder_right"])
+    both = (joints("shoulder_left") + joints("shoulder_right")).isfinite().all(-1)
+    to_head, to_neck = joints("head") - middle, joints("neck") - middle
+    share = (to_neck * to_head).sum(-1) / to_head.square().sum(-1)
+    return _mostly(torch.where(both, share, torch.nan), _LOW_NECK)
+
+
+def _mostly(values: Float[Tensor, " T"], bound: float) -> bool:
+    """Return whether most of the values that are known lie below a bound."""
+    known = values[values.isfinite()]
+    return len(known) > 0 and float((known < bound).double().mean()) > _MOST

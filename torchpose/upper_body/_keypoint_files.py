@@ -251,14 +251,16 @@ class KeypointFileTracker:
         if fps is None:
             rate = self.prior.info.fps or 30
             more += (f"the keypoint file states no frame rate: {rate:g} fps assumed",)
+        kind = _kind_of_neck(settings.neck, keypoints)
         key = _Key(
             tuple(camera.matrix.flatten().tolist()),
             camera.image_size,
             None if camera.up is None else tuple(camera.up.tolist()),
             fps,
-            _kind_of_neck(settings.neck, keypoints),
+            kind,
         )
-        notes += (*keypoints.notes, *doubts_about(keypoints), *more)
+        told = kind is not None or self.prior.info.neck != "neck"
+        notes += (*keypoints.notes, *doubts_about(keypoints, told, camera.up), *more)
         return PreparedTracker(self._tracker(key, camera), camera, names, notes)
 
     @in_inference_mode

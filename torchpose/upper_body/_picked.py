@@ -6,7 +6,7 @@ from typing import NamedTuple
 from torchpose.errors import InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import KINECT_NECK
-from torchpose.skeleton._upper_body import upper_body_indices
+from torchpose.skeleton._upper_body import neck_of_detectors, upper_body_indices
 from torchpose.upper_body._face_points import FACE
 
 _NECK = UPPER_BODY.index("neck")
@@ -91,7 +91,7 @@ def pick_joints(
         )
     found = upper_body_indices(names)
     indices = list(found.indices)
-    kind = neck or found.neck
+    kind = neck or found.neck or neck_of_detectors(names)
     middle, notes = False, []
     other = indices[_NECK] >= 0 and None not in (kind, wanted_neck) and kind != wanted_neck
     if other or indices[_NECK] < 0:
