@@ -16,6 +16,7 @@ from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors._actions.action_file import ActionInfo
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.skeleton._joint_sets import SKELETONS
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 from torchpose.whole_body import BodyTrack
 
 
@@ -65,6 +66,15 @@ def test_recordings_and_cameras(torchpose, files, tmp_path):
     PinholeCamera(600, 610, 330, 250, name="door").save(tmp_path / "cameras.toml")
     done = torchpose("info", tmp_path / "cameras.toml")
     assert done.out == "door  f = (600, 610), centre (330, 250) pixels\n"
+
+
+def test_a_table_as_wide_as_those_of_a_kinect(torchpose, tmp_path):
+    """MediaPipe's 33 landmarks with visibilities have as many columns as 25 joints with states."""
+    head = ["frame", *(f"{name}_{kind}" for name in LANDMARKS for kind in ("x", "y", "visibility"))]
+    row = ["0", *map(str, range(200, 200 + 3 * len(LANDMARKS)))]
+    row[3::3] = ["0.9"] * len(LANDMARKS)
+    (tmp_path / "pose.csv").write_text("\n".join([",".join(head), ",".join(row)]))
+    assert "elbow_left 100 %" in torchpose("info", tmp_path / "pose.csv").out
 
 
 def test_recordings_of_every_layout(torchpose, tmp_path):

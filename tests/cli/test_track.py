@@ -361,7 +361,8 @@ BAD_INPUT = {
     "missing file": (["{tmp}/no.npz"], "no.npz: no such file"),
     "truncated": (["{tmp}/truncated.npz"], "expected an .npz file"),
     "foreign keys": (["{files}/recordings/p1.npz"], "expected the key keypoints"),
-    "other suffix": (["{tmp}/notes.txt"], "keypoints are expected as .npz, .csv or a folder"),
+    "other suffix": (["{tmp}/notes.txt"], "expected keypoints as .npz, .csv or a folder"),
+    "other program": (["{tmp}/dlc.h5"], "got .h5; write those of other programs as a .csv"),
     "unknown names": (["{tmp}/names.npz"], "antenna"),
     "no upper body": (["{tmp}/knees.npz"], "expected some of hand_left"),
     "no camera": (["{tmp}/no_camera.npz"], "expected --camera FILE"),
@@ -423,6 +424,7 @@ BAD_INPUT = {
 @pytest.fixture
 def bad_files(tmp_path, files):
     (tmp_path / "notes.txt").write_text("no keypoints")
+    (tmp_path / "dlc.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))  # video to FFmpeg
     (tmp_path / "bad.yaml").write_text("{out: [")
     (tmp_path / "key.yaml").write_text("speed: 9\n")
     whole = (files / "keypoints.npz").read_bytes()

@@ -34,7 +34,10 @@ torchpose track keypoints.npz --out result --method pf-mixture --n-particles 100
 torchpose track keypoints.npz --out result --print_config > track.yaml
 torchpose track --config track.yaml"""
 _JOINT_STDS = 5
-_KEYPOINT_FILES = (".npz", ".csv")
+_NO_VIDEOS = (
+    ".npz", ".csv", ".json", ".txt", ".tsv", ".h5", ".hdf5", ".npy", ".pkl", ".pickle", ".mat", ".xlsx",
+    ".parquet",
+)  # fmt: skip
 PYTHON_ONLY = frozenset({
     "likelihood_power", "uniform_weight", "transition", "gamma", "subspace", "burn_in",
     "burn_in_scale", "weighting", "reset_below", "resample_threshold", "resampling", "start",
@@ -166,11 +169,14 @@ def track_keypoints(job: TrackingJob) -> int:
 
 
 def is_video(where: str) -> bool:
-    """Return whether it is a video, a folder of images or a camera, and not keypoints."""
+    """Return whether it is a video, a folder of images or a camera, and not keypoints.
+
+    Tables that other programs write count as keypoints: FFmpeg takes some for video, as DeepLabCut's .h5.
+    """
     path = Path(where)
     if path.is_dir():
         return not any(path.glob("*.json"))
-    return path.suffix.lower() not in _KEYPOINT_FILES
+    return path.suffix.lower() not in _NO_VIDEOS
 
 
 def parse_stds(value: Any) -> float | list[float] | None:

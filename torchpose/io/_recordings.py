@@ -250,6 +250,14 @@ def _may_hold_joints(path: Path) -> bool:
         return True  # reading it gives the error
 
 
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell or "nan")
+    except ValueError:
+        return False
+    return True
+
+
 def looks_recorded(path: Path) -> bool:
     """Return whether a file that is no .npz begins as recordings of 3D joints do.
 
@@ -263,7 +271,8 @@ def looks_recorded(path: Path) -> bool:
         lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
         first = split_row(lines[0]) if lines else []
         daily = suffix == ".txt" and first[1:] == ["20"]
-        return len(first) in ROW_LENGTHS or daily or (bool(lines) and bool(header_joints(lines[0])))
+        row = len(first) in ROW_LENGTHS and all(map(_is_number, first))
+        return row or daily or (bool(lines) and bool(header_joints(lines[0])))
     if suffix == ".json":
         return '"joint_positions"' in start or '"bone_list"' in start
     if suffix == ".bvh":

@@ -93,16 +93,15 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     strange = [h for h in header if h not in wanted]
     absent = [f"{n}_y" for n in names if f"{n}_y" not in column]
     if names and strange:
-        more = f" and {len(strange) - _SHOWN} more" if len(strange) > _SHOWN else ""
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],...; delete or rename "
-            f"{', '.join(strange[:_SHOWN])}{more} (a score is NAME_confidence; no time is "
+            f"{_some(strange)} (a score is NAME_confidence; no time is "
             "read: write # fps = 30 above the header)"
         )
     if not names or absent or len(column) != len(header):
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],... each once, got "
-            f"{', '.join(absent) or ','.join(header)}" + " (absent)" * bool(absent)
+            f"{_some(absent or header)}" + " (absent)" * bool(absent)
         )
     table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
     table = table.reshape(-1, len(header))
@@ -117,6 +116,12 @@ def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
             given = column.get(f"{name}_{trust}")
             confidence[index, j] = 1.0 if given is None else table[:, given]
     return RawKeypoints(points, tuple(names), confidence, first_frame=first)
+
+
+def _some(columns: Sequence[str]) -> str:
+    """Return the first columns, and how many more there are."""
+    more = len(columns) - _SHOWN
+    return ", ".join(columns[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
