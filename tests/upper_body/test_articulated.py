@@ -8,11 +8,14 @@ import pytest
 import torch
 
 import torchpose
+from tests.data import data_dir_or_skip
 from tests.upper_body.seen import see_torso
 from torchpose.errors import InputError
+from torchpose.io import read_recordings
 from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import LENGTHS, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
@@ -25,6 +28,9 @@ from torchpose.upper_body._torso_likelihood import half_widths
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
 ROW = {name: i for i, name in enumerate(UPPER_BODY)}
 PRIOR = torchpose.load_prior("kinect-upper-body-small")
+ARMS = tuple(
+    f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist") for side in ("left", "right")
+)
 
 
 def body(n_frames=60, turn=0.0, depth=2.2, scale=1.0):
@@ -525,3 +531,22 @@ def test_limbs_that_nobody_sees_are_expected_nearer_than_their_lengths():
     torch.testing.assert_close(lengths[0], whole.bone_lengths[0, :, 0], atol=1e-6, rtol=0)
     torch.testing.assert_close(lengths[0][:20], lengths[1][:20])
     assert bool((lengths[1][20:] < track.bone_lengths[0, 20:, 0] - 1e-4).all())
+
+
+def test_more_frames_a_second_are_no_worse():
+    """The walk of the hypotheses is not narrower than they are apart: they stuck at 120 frames a second."""
+    clip = data_dir_or_skip("kinect_laban") / "Ges02_balancinghands.csv"
+    (recording,) = read_recordings([clip])
+    places = [canonical_names(recording.names).index(name) for name in ARMS]
+    slow = recording.joints[:90, places].double()
+    t = torch.arange(4 * (len(slow) - 1)) / 4
+    first, share = t.long(), (t % 1)[:, None, None]
+    fast = (1 - share) * slow[first] + share * slow[first + 1]
+    off = {}
+    for fps, joints in ((30.0, slow), (120.0, fast)):
+        follow = UpperBodyTracker(PRIOR, CAMERA, "articulated", fps=fps)
+        found = follow(pixels(joints, 3.0)[None], names=ARMS).joints3d[0]
+        found = found[:, [ROW[name.replace("wrist", "hand")] for name in ARMS]]
+        apart = (found - found[:, :2].mean(1, True)) - (joints - joints[:, :2].mean(1, True))
+        off[fps] = float(torch.linalg.vector_norm(apart[:, 2:], dim=-1).mean())
+    assert off[120.0] < 1.2 * off[30.0], off

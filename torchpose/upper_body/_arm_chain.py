@@ -199,7 +199,7 @@ class ArmChain:
         p(x' | x) = (1 - e) t_4(x'; x, s^2) + e p(x')
 
     An arm whose hand is not measured moves less (s = 5 degrees, e = 0.02 at 30 frames a second, else 10 and
-    0.2): what is not seen is best expected where it was.
+    0.2): what is not seen is best expected where it was. Above 30 frames a second steps are not smaller.
 
     Args:
         density: the log-density of the prior over directions. fps: frames per second.
@@ -207,10 +207,11 @@ class ArmChain:
 
     def __init__(self, density: DirectionDensity, fps: float) -> None:
         self.density = density
-        frames = _RATE / fps
+        # Hypotheses are about as far apart as a step at 30 frames a second: a smaller one sticks to them.
+        frames = max(_RATE / fps, 1.0)
         self.step, self.step_unseen = _STEP * math.sqrt(frames), _STEP_UNSEEN * math.sqrt(frames)
         self.anew = 1 - (1 - _ANEW) ** frames
-        self.anew_unseen = 1 - (1 - _ANEW_UNSEEN) ** frames
+        self.anew_unseen = 1 - (1 - _ANEW_UNSEEN) ** (_RATE / fps)
 
     def hypotheses(self, arm: ArmInput, angles: int = _ANGLES, around: int = _AROUND) -> Arms:
         """Return hypotheses that agree with the measurements of each arm, given each hypothesis of the root.

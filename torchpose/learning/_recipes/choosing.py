@@ -101,8 +101,8 @@ def recorded_joints(recording: Recording, fps: float) -> Tensor:
     if len(gaps):
         frame, joint = gaps[0].tolist()
         raise InputError(
-            f"{name}: {BODY_15.names[joint]} is missing in frame {frame}; end the recording there, or "
-            "fill the gap"
+            f"{recording.path or name}: {BODY_15.names[joint]} is missing in frame {frame}; end the "
+            "recording there, fill the gap, or leave the file out"
         )
     return resample_frames(joints, recording.fps, fps)
 
