@@ -122,8 +122,11 @@ def check_pixels(name: str, points: Tensor, there: Tensor) -> None:
     """
     if not values_visible():
         return
-    given = points.detach()[there & (points != 0).any(-1)]
-    shares = (given.abs() <= _LARGEST_SHARE).all(-1)
+    small = (points.detach().abs() <= _LARGEST_SHARE).all(-1)
+    if not bool(small.any()):  # as nearly always
+        return
+    counted = there & (points != 0).any(-1)
+    given, shares = points.detach()[counted], small[counted]
     if len(given) >= _SEVERAL and 2 * int(shares.sum()) > len(given):
         raise InputError(
             f"{name} must be in pixels, got most of them between {float(given[shares].min()):.3g} and "
