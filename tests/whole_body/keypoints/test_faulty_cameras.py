@@ -1,5 +1,6 @@
 """Cameras that stand still, are turned, or see somebody else are noticed, and do not draw the body away."""
 
+import copy
 import math
 
 import pytest
@@ -35,9 +36,11 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_a_rolled_camera,
     notes_on_cameras_now,
 )
+from torchpose.whole_body._keypoints.turn_looks import _mean_turn
 from torchpose.whole_body._keypoints.turned_cameras import (
     angles_of,
     find_turns,
+    is_turned,
     turned,
     unlikely,
 )
@@ -54,7 +57,7 @@ def track(keypoints, rig):
 
 def with_turn(rig: CameraRig, camera: int, degrees: float) -> CameraRig:
     """A rig of which one camera is said to be turned about its x axis by so much more."""
-    other = ring(len(rig))
+    other = copy.deepcopy(rig)
     turn = rotvec_to_matrix(torch.tensor([math.radians(degrees), 0.0, 0.0]).double())
     other.rotation[camera] = turn @ rig.rotation[camera]
     other.translation[camera] = turn @ rig.translation[camera]
@@ -104,7 +107,7 @@ def turned_scene(three, degrees):
 
 
 def test_turns_become_better_known_with_more_frames(three):
-    rig, filter, frames = turned_scene(three, (3.0, -3.0, 3.0))
+    rig, filter, frames = turned_scene(three, (0.0, 0.0, 3.0))
     faults, _, better = find_faults(filter, frames[0], CameraFaults.none(frames[0]))
     assert bool(better.all())
     true = three.rig.rotation.mT @ rig.rotation
@@ -114,6 +117,37 @@ def test_turns_become_better_known_with_more_frames(three):
         errors.append(angles_of(faults.turn[0] @ true.mT).mean())
     assert float(faults.looks.n_frames[0]) == 5.0
     assert float(errors[-1]) < 0.6 * float(errors[0])
+
+
+def looked_at(three, errors):
+    """What is believed of turned cameras after frames of a body that stands still, with errors in pixels."""
+    _, filter, frames = turned_scene(three, (0.0, 5.0, 0.0))
+    exact = three.rig(three.joints[:1]).pixels
+    frames = [frames[0]._replace(pixels=exact + error) for error in errors]
+    faults, _, _ = find_faults(filter, frames[0], CameraFaults.none(frames[0]))
+    for frame in frames[1:]:
+        faults = looked_at_again(filter, faults, frame)
+    return faults
+
+
+def test_errors_that_last_do_not_count_in_every_frame(three):
+    shape, generator = (20, 3, len(NAMES), 2), torch.Generator().manual_seed(0)
+    errors = 3 * torch.randn(shape, generator=generator, dtype=torch.float64)
+    often, once = looked_at(three, errors), looked_at(three, errors[:1].expand(20, -1, -1, -1))
+    assert float(often.looks.n_frames) == float(once.looks.n_frames) == 5.0
+    assert float(often.looks.lasting) < 0.1 and float(once.looks.lasting) > 0.9
+    assert bool(is_turned(once.turn)[0, 1])
+
+
+def test_turns_are_a_mean_over_explanations_as_far_as_errors_last():
+    turn = torch.eye(3).double().repeat(1, 4, 2, 1, 1)
+    for explanation, camera in ((0, 0), (1, 1)):
+        turn[0, explanation, camera] = rotvec_to_matrix(torch.tensor([0.04, 0.0, 0.0]).double())
+    cost = torch.tensor([[0.0, 0.1, 50.0, 60.0]]).double()
+    found = [angles_of(_mean_turn(turn, cost, cost.new_tensor([part])))[0] for part in (0.0, 1.0)]
+    assert found[0].tolist() == pytest.approx([0.04, 0.0], abs=1e-9)
+    assert found[1].tolist() == pytest.approx([0.021, 0.019], abs=1e-4)
+    assert bool((_mean_turn(turn, -cost, cost.new_ones(1)) == torch.eye(3)).all())
 
 
 def test_what_is_known_of_turns_outlasts_another_search(three):

@@ -4,6 +4,13 @@ A turn that one frame tells takes up the noise of its keypoints, and a detector'
 the first frame on that says cameras are turned, frames are kept, at growing distances in time. With each new
 one all explanations by turns are estimated again from all frames that are kept: one camera is turned, all
 are, or none is. The likeliest one holds from then on.
+
+What a detector has wrong of a joint in a camera lasts from frame to frame. Of errors of which a share rho
+lasts, n frames tell as much as n / (1 + rho (n - 1)) whose errors are independent, so each counts that much
+less. The share is told by the errors themselves: that of the mean over frames in their squares is
+rho + (1 - rho) / n. Errors that last may also look like another turn. So as far as they do, turns are the
+mean over the explanations, by their probabilities. Where the likeliest one does not explain a camera's
+keypoints, its errors say nothing of the detector, and frames count as independent.
 """
 
 from typing import NamedTuple, Self
@@ -12,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns
@@ -22,6 +30,8 @@ _RATHER_ALL = 4.0
 # What a camera that is turned by much has besides, such as a cropped image, is not to turn the others.
 _FAR = 0.1  # radians from which that is so
 _MORE = 0.02  # share of what it explains that all have to explain on top
+_POOR = 2.0  # misfit of a camera's keypoint on average, from which on its errors are no detector's
+_LEAST = 1e-9  # of a sum by which another is divided
 _GAP = 0.05  # seconds from the first frame to the second; each next gap is longer by as much
 
 
@@ -32,12 +42,14 @@ class TurnLooks(NamedTuple):
         frames: keypoints [B, K, C, J], those that are not there yet without trust.
         n_frames: [B], how many there are, 0 where no camera is turned. age: [B], frames since the first.
         turn: [B, H, C, 3, 3], by each of the explanations of `free_turns`.
+        lasting: [B], share of the errors of keypoints that lasts, 0 where there is one frame.
     """
 
     frames: KeypointFrame
     n_frames: Tensor
     age: Tensor
     turn: Tensor
+    lasting: Tensor
 
     @classmethod
     def none(cls, frame: KeypointFrame) -> Self:
@@ -48,7 +60,8 @@ class TurnLooks(NamedTuple):
         )
         eye = torch.eye(3).to(frame.pixels)
         turn = eye.expand(count, n_cameras + 2, n_cameras, 3, 3)
-        return cls(frames, frame.inlier.new_zeros(count), frame.inlier.new_zeros(count), turn)
+        zero = frame.inlier.new_zeros(count)
+        return cls(frames, zero, zero, turn, zero)
 
     @classmethod
     def begun(cls, frame: KeypointFrame, turn: Float[Tensor, "B H C 3 3"]) -> Self:
@@ -56,7 +69,7 @@ class TurnLooks(NamedTuple):
         first = cls.none(frame)
         place = first.n_frames.long()
         frames = mapped(lambda kept, new: _with_frame(kept, new, place), first.frames, frame)
-        return cls(frames, torch.ones_like(first.n_frames), first.age, turn)
+        return first._replace(frames=frames, n_frames=torch.ones_like(first.n_frames), turn=turn)
 
 
 def free_turns(n_cameras: int, device: torch.device) -> Bool[Tensor, "H C"]:
@@ -94,18 +107,56 @@ def _estimated(
     n, n_cameras = frame.inlier.shape[:2]
     free = free_turns(n_cameras, frame.inlier.device)
     rows = torch.arange(n, device=place.device)
-    side_by_side = frames.map(lambda value: value[:, :used].transpose(1, 2).flatten(2, 3))
+    share = 1 / (1 + looks.lasting * looks.n_frames)
+    counted = frames._replace(inlier=frames.inlier * share[:, None, None, None])
+    side_by_side = counted.map(lambda value: value[:, :used].transpose(1, 2).flatten(2, 3))
     found = find_turns(
         side_by_side.take(rows.repeat_interleave(len(free))), free.repeat(n, 1), maps,
         looks.turn.flatten(0, 1),
     )  # fmt: skip
     turn = found.matrix.view_as(looks.turn)
-    best = _likeliest((found.misfit + found.price).view(n, -1), angles_of(turn))
-    return TurnLooks(frames, looks.n_frames + 1, looks.age, turn), turn[rows, best]
+    cost = _with_odds((found.misfit.sum(-1) + found.price).view(n, -1), angles_of(turn))
+    chosen = rows * len(free) + cost.argmin(-1)
+    lasting = _lasting(found.errors[chosen], found.weights[chosen], used)
+    poor = (found.misfit[chosen] > _POOR * side_by_side.inlier.sum(-1)).any(-1)
+    lasting = lasting.masked_fill(poor, 0.0)
+    after = TurnLooks(frames, looks.n_frames + 1, looks.age, turn, lasting)
+    return after, _mean_turn(turn, cost, lasting)
 
 
-def _likeliest(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Int[Tensor, " B"]:
-    """Return the likeliest explanations.
+def _lasting(
+    errors: Float[Tensor, "B C N 2"], weights: Float[Tensor, "B C N"], n_frames: int
+) -> Float[Tensor, " B"]:
+    """Return the share rho of squared errors that is that of an error which lasts.
+
+    Args:
+        errors: over the standard deviations of their noise, those of one frame after the other. weights:
+            of these. n_frames: how many there are.
+    """
+    errors, weights = (value.unflatten(2, (n_frames, -1)) for value in (errors, weights))
+    total = (weights * errors.square().sum(-1)).sum((-3, -2, -1))
+    summed, weight = (weights[..., None] * errors).sum(2), weights.sum(2).clamp_min(_LEAST)
+    of_means = (summed.square().sum(-1) / weight).sum((-2, -1))
+    there = weights > 0
+    n_each = there.sum((-3, -2, -1)) / there.any(2).sum((-2, -1)).clamp_min(1)
+    ratio = of_means / total.clamp_min(_LEAST)
+    return ((n_each * ratio - 1) / (n_each - 1).clamp_min(_LEAST)).clamp(0, 1)
+
+
+def _mean_turn(
+    turn: Float[Tensor, "B H C 3 3"], cost: Float[Tensor, "B H"], lasting: Float[Tensor, " B"]
+) -> Float[Tensor, "B C 3 3"]:
+    """Return the likeliest turns, or as far as errors last the mean of all; none, if none is likeliest."""
+    best = cost.argmin(-1)
+    sure = torch.nn.functional.one_hot(best, cost.shape[-1]).to(cost)
+    share = torch.lerp(sure, (-cost).softmax(-1), lasting[:, None])
+    mean = rotvec_to_matrix((share[..., None, None] * matrix_to_rotvec(turn)).sum(1))
+    none = best == cost.shape[-1] - 1
+    return torch.where(none[:, None, None, None], turn[:, -1], mean)
+
+
+def _with_odds(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Float[Tensor, "B H"]:
+    """Return what explanations cost with the prior odds of one camera and of all.
 
     Args:
         cost: minus the log-evidence of each. angles: of its turns, radians.
@@ -114,7 +165,7 @@ def _likeliest(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> In
     far = angles.amax(-1).gather(1, whose[:, None]).squeeze(-1) > _FAR
     handicap = torch.where(far, _MORE * (cost[:, -1] - alone), -_RATHER_ALL)
     all_cameras = cost[:, -2] + handicap
-    return torch.cat([cost[:, :-2], all_cameras[:, None], cost[:, -1:]], -1).argmin(-1)
+    return torch.cat([cost[:, :-2], all_cameras[:, None], cost[:, -1:]], -1)
 
 
 def _with_frame(kept: Tensor, new: Tensor, place: Tensor) -> Tensor:

@@ -38,13 +38,16 @@ class Turns(NamedTuple):
     """Holds turns [N, C, 3, 3] of cameras in world axes, and what each choice of free turns costs [N].
 
     `price` is what free turns take from the log-evidence, about Laplace's approximation:
-    2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2, with S the information about the turns. `misfit` is what the
-    errors of keypoints take from it.
+    2 log(1 + |w|^2 / s^2) + log det(S s^2) / 2, with S the information about the turns. `misfit` [N, C] is
+    what the errors of each camera's keypoints take from it. `errors` [N, C, J, 2] are those over the standard
+    deviations of their noise, and `weights` [N, C, J] how much each counts.
     """
 
     matrix: Tensor
     price: Tensor
     misfit: Tensor
+    errors: Tensor
+    weights: Tensor
 
 
 def turned(
@@ -109,7 +112,7 @@ def find_turns(
         large = 1 + rotvec.square().sum(-1) / _TURN**2
         prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
         prior = prior[..., None].expand_as(rotvec).flatten(1)
-        chol, F, b, S, g, _ = _equations(frame, rays @ turn.mT, joints, maps, width)
+        chol, F, b, S, g = _equations(frame, rays @ turn.mT, joints, maps, width)
         L = torch.linalg.cholesky((S + S.mT) / 2 + torch.diag_embed(prior))
         step = torch.cholesky_solve((-g - prior * rotvec.flatten(1))[..., None], L)
         joints = joints + torch.cholesky_solve(b + F @ step[:, None], chol).squeeze(-1)
@@ -118,8 +121,11 @@ def find_turns(
     known_before = 1.5 * torch.where(free, -2 * math.log(_TURN), math.log(_KNOWN))
     narrowed = L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - known_before.sum(-1)
     spent = torch.where(free, _unlikely(rotvec), 0.0).sum(-1)
-    misfit = _equations(frame, rays @ turn.mT, joints, maps, 1.0)[-1]
-    return Turns(torch.where(free[..., None, None], turn, eye), spent + narrowed, misfit)
+    errors, trust = _errors(frame, _pixels(rays @ turn.mT, maps)[0], joints, maps)
+    ratio = errors.square().sum(-1) / _FREEDOM
+    misfit = _FREEDOM / 2 * (trust * ratio.log1p()).sum(-1)
+    matrix = torch.where(free[..., None, None], turn, eye)
+    return Turns(matrix, spent + narrowed, misfit, errors, trust / (1 + ratio))
 
 
 def _first_joints(
@@ -138,12 +144,12 @@ def _equations(
     joints: Float[Tensor, "N J 3"],
     maps: RigMaps,
     width: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return a factor of the information about joints, and the normal equations with them eliminated.
 
     Returns:
         The factor [N, J, 3, 3], F [N, J, 3, 3 C] and b [N, J, 3, 1] of the joints; S [N, 3 C, 3 C] and g
-        [N, 3 C] of the turns; and what the errors cost [N].
+        [N, 3 C] of the turns.
     """
     pixels, by_ray = _pixels(rays, maps)
     seen = see(maps, joints)
@@ -161,8 +167,19 @@ def _equations(
     Y, y = solved[..., :-1], solved[..., -1:]
     S = _block_diagonal(T.mT @ T) - Y.mT @ Y
     g = (T.mT @ r.flatten(2)[..., None]).flatten(1) - (Y.mT @ y).squeeze(-1)
-    misfit = _FREEDOM / 2 * (trust * torch.log1p(square / (_FREEDOM * variance))).sum((-2, -1))
-    return chol, F, b, S, g, misfit
+    return chol, F, b, S, g
+
+
+def _errors(
+    frame: KeypointFrame,
+    pixels: Float[Tensor, "N C J 2"],
+    joints: Float[Tensor, "N J 3"],
+    maps: RigMaps,
+) -> tuple[Float[Tensor, "N C J 2"], Float[Tensor, "N C J"]]:
+    """Return errors of turned keypoints over the standard deviations of their noise, and their trust."""
+    seen = see(maps, joints)
+    off = pixels - seen.pixels
+    return off / _variance(frame, seen).sqrt()[..., None], frame.inlier * seen.in_front
 
 
 def _variance(frame: KeypointFrame, seen: Seen) -> Float[Tensor, "N C J"]:
