@@ -7,9 +7,11 @@ import torch
 
 from tests.whole_body.keypoints.scenes import FPS, moving_body, ring
 from torchpose.errors import InputError, NobodySeenError, ShapeError
+from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body import BodyTracker
 from torchpose.whole_body._keypoints.people_association import assign, detection_gains
 from torchpose.whole_body._keypoints.people_tracker import PeopleTracker
+from torchpose.whole_body._keypoints.turned_cameras import angles_of
 
 T = 40
 
@@ -75,6 +77,17 @@ def test_a_camera_that_is_turned_is_used_all_the_same():
     # by 1.3 degrees joints are 9 cm off at 4 m, seven times the noise of keypoints
     for one in found:
         assert (one.details["detection"] >= 0).double().mean(0).min() > 0.95
+
+
+def test_a_camera_that_is_turned_is_turned_back_for_everybody():
+    rig, _, pixels = passing(4)
+    turn = rotvec_to_matrix(torch.tensor([math.radians(1.5), 0.0, 0.0]).double())
+    rig.rotation[1], rig.translation[1] = turn @ rig.rotation[1], turn @ rig.translation[1]
+    found = tracker(rig)(keypoints=shuffled(pixels)[0], persons="all")
+    assert len(found) == 2
+    for track in found:
+        angles = torch.rad2deg(angles_of(track.details["camera_turn"][-1]))
+        assert angles.tolist() == pytest.approx([0.0, 1.5, 0.0, 0.0], abs=0.1)
 
 
 def test_live_has_the_same_numbers():

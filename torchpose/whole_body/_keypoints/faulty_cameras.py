@@ -163,12 +163,13 @@ def find_faults(
     frame: KeypointFrame,
     faults: CameraFaults,
     begun: CorrectedBody | None = None,
+    turns_alone: bool = False,
 ) -> tuple[CameraFaults, CorrectedBody, Bool[Tensor, " B"]]:
     """Return the likeliest faults of cameras, who begins anew with them, and whether they are new.
 
     Args:
         filter: that tracks on. frame: keypoints as they were detected. faults: that were known so far.
-        begun: who has just begun with these, if all have.
+        begun: who has just begun with these, if all have. turns_alone: whether all cameras see the person.
     """
     known = start(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
     least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) - unlikely(faults.turn)
@@ -182,12 +183,12 @@ def find_faults(
     evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
     wrong = _any_wrong(off, turn)
     refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
+    refused = refused | off if turns_alone else refused
     evidence = torch.where(refused.any(-1) & wrong, -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
     better = evidence.amax(-1) > least + _LEAST_GAIN
     looks = TurnLooks.begun(frame, tried.turn[:, : tried.n_turns])
     looks = looks._replace(n_frames=is_turned(turn[best]).any(-1).to(looks.n_frames))
-    pause = torch.full_like(faults.doubted, -_PAUSE * filter.fps)
     new = faults._replace(
         turn=turn[best],
         off=off[best],
@@ -197,8 +198,13 @@ def find_faults(
     )
     rows = better.nonzero().squeeze(-1)
     after = mapped(lambda old, other: old.index_copy(0, rows, other[rows]), faults, new)
-    after = after._replace(doubted=torch.where(better, 0.0, pause))
+    after = after._replace(doubted=torch.where(better, 0.0, paused(filter, faults).doubted))
     return after, known.put(rows, found.take(best[rows])), better
+
+
+def paused(filter: BodyKalmanFilter, faults: CameraFaults) -> CameraFaults:
+    """Return the faults with no further search for some seconds."""
+    return faults._replace(doubted=torch.full_like(faults.doubted, -_PAUSE * filter.fps))
 
 
 def _of_nobody(

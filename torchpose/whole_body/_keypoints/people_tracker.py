@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
+from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
@@ -19,6 +20,11 @@ from torchpose.whole_body._keypoints.people_association import (
     left_over,
     owned_detections,
     taken_detections,
+)
+from torchpose.whole_body._keypoints.people_cameras import (
+    Tracked,
+    righted,
+    with_watched_cameras,
 )
 
 _CONFIRM_TIME, _CONFIRM_FRAMES = 0.1, 3  # seconds, and frames at least, that confirm a person
@@ -42,6 +48,7 @@ class PeopleStream(NamedTuple):
         unseen: [P], frames in a row without keypoints. doubled: [P], frames in a row at another's place.
         identity: [P], from 1 on in the order in which they were confirmed, 0 of those who are tentative.
         n_confirmed: of identities that were given.
+        faults: what is believed of the cameras, of one element; None before somebody was there.
     """
 
     bodies: KeypointStream | None
@@ -53,6 +60,7 @@ class PeopleStream(NamedTuple):
     doubled: Tensor
     identity: Tensor
     n_confirmed: int
+    faults: CameraFaults | None = None
 
 
 class PeopleFrame(NamedTuple):
@@ -95,6 +103,7 @@ class PeopleTracker:
             The next stream, and the persons of the frame, None if there is nobody.
         """
         stream = _nobody(frame) if stream is None else stream
+        detected, frame = frame, righted(self.tracker, frame, stream.faults)
         there = (frame.inlier > 0).any(-1).mT  # [C, D]
         found, free, weak = None, there, torch.zeros_like(stream.number, dtype=torch.bool)
         if stream.bodies is not None:
@@ -102,8 +111,21 @@ class PeopleTracker:
         stream, found = self._with_new(stream, found, frame, free, weak)
         if found is None:
             return stream, None
+        stream, found = self._watched(stream, found, detected)
         stream = self._counted(stream, found)
         return self._without_gone(stream), found._replace(identity=stream.identity)
+
+    def _watched(
+        self, stream: PeopleStream, found: PeopleFrame, detected: KeypointFrame
+    ) -> tuple[PeopleStream, PeopleFrame]:
+        """Return the stream and the frame, with keypoints as they were detected, by cameras as they are."""
+        assert stream.bodies is not None
+        keypoints = taken_detections(detected, found.detection)
+        tracked = Tracked(stream.bodies, found.poses, found.corrected)
+        faults, tracked = with_watched_cameras(self.tracker, stream.faults, tracked, keypoints)
+        bodies, poses, corrected = tracked
+        stream = stream._replace(bodies=bodies, faults=faults)
+        return stream, found._replace(keypoints=keypoints, poses=poses, corrected=corrected)
 
     # --- persons who are there --------------------------------------------------------------------
 
@@ -176,8 +198,9 @@ class PeopleTracker:
         zero = poses.log_evidence.new_zeros(len(groups))
         n_begun = stream.n_begun + len(groups)
         beginners = PeopleStream(
-            bodies, number, n_begun, zero, zero, zero, zero, identity, stream.n_confirmed
-        )
+            bodies, number, n_begun, zero, zero, zero, zero, identity, stream.n_confirmed,
+            stream.faults,
+        )  # fmt: skip
         rows, keep = (flags.nonzero().squeeze(-1) for flags in (sure, ~owner[:, sure].any(-1)))
         stream = self._kept(stream, keep)._replace(n_begun=n_begun)
         if not len(rows):
@@ -185,7 +208,9 @@ class PeopleTracker:
         beginners, begun = self._kept(beginners, rows), taken(begun, rows)
         if stream.bodies is None or found is None:
             return beginners, begun
-        return _joined(stream, beginners), _joined(taken(found, keep), begun)
+        faults = stream.faults
+        joined = _joined(stream._replace(faults=None), beginners._replace(faults=None))
+        return joined._replace(faults=faults), _joined(taken(found, keep), begun)
 
     def _has_room(self, new: Bool[Tensor, " G"], count: int) -> Bool[Tensor, " G"]:
         """Return which groups may begin: persons who are there already, and others up to the most."""
