@@ -19,6 +19,7 @@ from torchpose.camera import (
     sample_viewpoints,
     save_cameras,
 )
+from torchpose.camera._pinhole import read_cameras
 from torchpose.camera._projection import backproject, check_intrinsics, map_pixel_covariance
 from torchpose.camera._viewpoints import PAPER_VIEWS
 from torchpose.errors import CameraError, FileFormatError, InputError, OutputError, ShapeError
@@ -432,3 +433,65 @@ def test_scaled_views_keep_their_middle() -> None:
     assert narrow.tx == pytest.approx((-0.05, 0.25)) and narrow.ty == pytest.approx((0.1, 0.1))
     assert narrow.tz == pytest.approx((1.5, 2.5))
     assert views.scaled(1.0).tx == pytest.approx(views.tx)
+
+
+CALISCOPE = """
+CreationDate = 2023-05-06T11:12:27.631355
+fps_recording = 24
+
+[cam_0]
+port = 0
+size = [ 1280, 720,]
+rotation_count = -1
+matrix = [ [ 894.5, 0.0, 624.0,], [ 0.0, 896.9, 361.3,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.3, 0.1, -0.001, 0.003, -0.004,]
+translation = [ -0.64, 0.26, 1.45,]
+rotation = [ [ 0.0, -1.0, 0.0,], [ 0.6, 0.0, -0.8,], [ 0.8, 0.0, 0.6,],]
+ignore = false
+
+[cam_4]
+port = 4
+size = [ 1280, 720,]
+ignore = true
+
+[capture_volume]
+stage = 2
+
+[charuco]
+columns = 4
+units = "inch"
+"""
+
+
+def test_the_configuration_of_caliscope(tmp_path):
+    """Its rotations are matrices, and tables of other things stand beside those of cameras."""
+    path = tmp_path / "config.toml"
+    path.write_text(CALISCOPE)
+    cameras, (note,) = read_cameras(path)
+    assert list(cameras) == list(load_cameras(path)) == ["cam_0"]
+    assert "[cam_4], [capture_volume], [charuco] are passed over" in note
+    expected = torch.tensor([[0, -1, 0], [0.6, 0, -0.8], [0.8, 0, 0.6]]).double()
+    torch.testing.assert_close(cameras["cam_0"].rotation_matrix, expected)
+    path.write_text(CALISCOPE.replace("ignore = true", "ignore = false"))
+    with pytest.raises(CameraError, match=r"\[cam_4\]: a camera needs `matrix`"):
+        load_cameras(path)
+
+
+def test_cameras_below_one_table(tmp_path):
+    path = tmp_path / "camera_array.toml"
+    path.write_text(f"[cameras.0]\ncam_id = 0\n{MATRIX}\n[cameras.side]\n{MATRIX}\n")
+    cameras, notes = read_cameras(path)
+    assert [camera.name for camera in cameras.values()] == list(cameras) == ["cam_0", "side"]
+    assert notes == ()
+
+
+def test_poses_as_opencv_returns_them():
+    rotation, translation = np.array([[0.2], [-0.3], [0.1]]), np.array([[0.1, 0.2, 3.0]])
+    camera = PinholeCamera(500, 500, 320, 240, rotation=rotation, translation=translation)
+    assert camera.rotation.tolist() == [0.2, -0.3, 0.1]
+    assert camera.translation.tolist() == [0.1, 0.2, 3.0]
+    again = PinholeCamera(500, 500, 320, 240, rotation=camera.rotation_matrix)
+    torch.testing.assert_close(again.rotation, camera.rotation)
+    for wrong in (2 * camera.rotation_matrix, -camera.rotation_matrix):
+        with pytest.raises(CameraError, match="must be a rotation"):
+            PinholeCamera(500, 500, 320, 240, rotation=wrong)

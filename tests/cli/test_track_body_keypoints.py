@@ -14,6 +14,7 @@ from torchpose import BodyTracker
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli._body_keypoint_inputs import read_body_keypoints
+from torchpose.cli._track_body import command
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.skeleton._joint_sets import SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
@@ -360,6 +361,38 @@ def test_a_page_that_begins_late_says_so(track, scene, tmp_path):
     assert (tmp_path / "out" / "joints.csv").read_text().splitlines()[1].startswith("3,")
     assert track(tmp_path / "on-time", "front_json", "left.csv", "behind.npz", *PLAIN).code == 0
     assert "of this page is" not in (tmp_path / "on-time" / "report.html").read_text()
+
+
+def test_lists_are_separated_by_blanks_or_commas():
+    files = ["cameras.toml", "a.npz", "b.npz", "c.npz"]
+
+    def read(*words):
+        values = command().given([*map(str, words), "--out", "out"]).values
+        return values["camera_names"], values["delays"], values["facing"], values["inputs"]
+
+    expected = (["a", "b", "c"], [0, 3, 10], [-1.0, 0.0, 0.5], files[1:])
+    for names, delays, facing in (
+        (["a", "b", "c"], [0, 3, 10], [-1, 0, 0.5]), (["a,b,c"], ["0,3,10"], ["-1,0,0.5"]),
+        (["[a, b, c]"], ["[0, 3, 10]"], ["[-1,0,0.5]"]),
+        (["[a,", "b,", "c]"], ["0,", "3,", "10"], ["[-1", "0", ".5]"]),
+    ):  # fmt: skip
+        lists = ["--camera-names", *names, "--delays", *delays, "--facing", *facing]
+        assert read(*files, *lists) == expected
+    # a list of one word may stand before what is given by its place
+    lists = ("--camera-names", "a,b,c", "--delays", "[0,3,10]", "--facing", "[-1,0,0.5]")
+    assert read(*lists, *files) == read(files[0], *lists, *files[1:]) == expected
+    assert read(*files[:2], "--camera-names", "a")[0] == ["a"]
+
+
+def test_tables_that_are_no_cameras_are_said(torchpose, scene, tmp_path):
+    text = (scene[0] / "cameras.toml").read_text() + "\n[charuco]\ncolumns = 4\n"
+    (tmp_path / "config.toml").write_text(text)
+    words = (scene[0] / "front.npz", "--camera-names", "front", *PLAIN)
+    done = torchpose("track-body", tmp_path / "config.toml", *words, "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    assert "[charuco] is passed over: no camera" in done.out
+    shown = torchpose("info", tmp_path / "config.toml")
+    assert "[charuco] is passed over" in shown.out
 
 
 def test_delays_bring_cameras_in_step(track, scene, tmp_path):

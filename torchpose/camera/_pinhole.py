@@ -5,10 +5,8 @@ Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions 
 """
 
 import math
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,22 +16,20 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_choice, check_floating, check_real
+from torchpose.camera._camera_tables import camera_tables, check_keys, table_text
 from torchpose.camera._projection import (
     check_intrinsics,
     intrinsics,
     project,
 )
 from torchpose.camera._tilt import level_rotation, unit_up, up_of_angles
-from torchpose.errors import CameraError, FileFormatError, InputError
-from torchpose.math._rotations import (
-    rotvec_to_matrix,
-)
+from torchpose.errors import CameraError, InputError
+from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
 
 _FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
 _LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none
 _LARGEST_SIDE = 100_000  # pixels of an image
-_KEYS = ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye", "up")
-_ALIKE = 0.8  # of two keys, of which one is the other misspelt
+_NOT_SQUARE = 1e-3  # by which R R^T may differ from the identity
 FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a webcam
 
 
@@ -47,7 +43,8 @@ class PinholeCamera(nn.Module):
         skew: K[0, 1], pixels; nearly always 0.
         distortions: OpenCV's k1, k2, p1, p2, ...; kept and saved, not applied by `forward`.
         rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues
-            vector in radians, and metres. The identity without them.
+            vector in radians or a matrix R [3, 3], and metres. The identity without them. Vectors may be
+            rows or columns, as OpenCV returns them.
         fisheye: the distortions are OpenCV's fisheye model.
         up: the direction that points up, against gravity, in the axes of the camera, of any length; None is
             unknown, and trackers take the camera to be about level, (0, -1, 0). `tilted` makes it of angles,
@@ -82,7 +79,7 @@ class PinholeCamera(nn.Module):
         *,
         skew: float = 0.0,
         distortions: Sequence[float] = (),
-        rotation: Sequence[float] = (0.0, 0.0, 0.0),
+        rotation: Sequence[float] | Sequence[Sequence[float]] = (0.0, 0.0, 0.0),
         translation: Sequence[float] = (0.0, 0.0, 0.0),
         fisheye: bool = False,
         up: Sequence[float] | None = None,
@@ -97,13 +94,7 @@ class PinholeCamera(nn.Module):
         self.fisheye = bool(fisheye)
         self.register_buffer("matrix", matrix.reshape(3, 3))
         self.register_buffer("distortions", _vector(f"distortions of {label}", distortions, None))
-        turn = _vector(f"rotation of {label}", rotation, 3)
-        if float(turn.norm()) > _LARGEST_TURN:
-            raise CameraError(
-                f"rotation of {label} must be a Rodrigues vector in radians of at most "
-                f"{_LARGEST_TURN:g}, got {turn.tolist()}; give degrees as radians"
-            )
-        self.register_buffer("rotation", turn)
+        self.register_buffer("rotation", _turn(f"rotation of {label}", rotation))
         self.register_buffer("translation", _vector(f"translation of {label}", translation, 3))
         self.register_buffer("up", _direction(f"up of {label}", up))
 
@@ -289,9 +280,10 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     """Read every camera of a TOML file.
 
     One table per camera with `matrix` (3 x 3, pixels) and, optionally, `size` (width, height),
-    `distortions`, `rotation` (Rodrigues vector), `translation` (metres), `name`, `fisheye`, `up` (the
-    direction that points up, camera axes). A table `[metadata]` is passed over. Pose2Sim and Anipose
-    write such files.
+    `distortions`, `rotation` (Rodrigues vector, or a 3 x 3 matrix), `translation` (metres), `name`,
+    `fisheye`, `up` (the direction that points up, camera axes). Pose2Sim, Anipose and Caliscope write such
+    files; the last may put the tables into one that is called `cameras`. Tables of other things, such as
+    `[metadata]` and `[charuco]`, are passed over.
 
     Args:
         path: the file.
@@ -303,23 +295,25 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
         InputError: no such file. FileFormatError: not TOML, or no camera in it.
         CameraError: a camera lacks its matrix or has values that no camera has.
     """
+    return read_cameras(path)[0]
+
+
+def read_cameras(path: str | Path) -> tuple[dict[str, PinholeCamera], tuple[str, ...]]:
+    """Return what `load_cameras` returns, and a note on tables that are passed over, if there are any."""
     from torchpose._core.reading import read_text, reading  # io imports this module
 
     expected = "a TOML camera file (torchpose.camera.save_cameras writes one)"
     text = read_text(path, expected)
     with reading(path, expected):
-        content = tomllib.loads(text)
-        return _cameras_of(path, content)
+        tables, left_out = camera_tables(path, tomllib.loads(text))
+        shown = ", ".join(f"[{name}]" for name in left_out)
+        note = f"{path}: {shown} {'are' if len(left_out) > 1 else 'is'} passed over: no camera"
+        return _cameras_of(path, tables), (note,) * bool(left_out)
 
 
-def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, PinholeCamera]:
-    tables = {
-        k: v
-        for k, v in content.items()
-        if isinstance(v, Mapping) and (k != "metadata" or "matrix" in v)
-    }
-    if not tables:
-        raise FileFormatError(f"{path}: expected a table per camera with `matrix`, found none")
+def _cameras_of(
+    path: str | Path, tables: Mapping[str, Mapping[str, Any]]
+) -> dict[str, PinholeCamera]:
     found = {name: _camera_from_table(f"{path} [{name}]", name, t) for name, t in tables.items()}
     if len(found) > 1:  # the poses of cameras of a rig count
         for name, table in tables.items():
@@ -371,6 +365,8 @@ def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
 
 def _vector(name: str, values: Any, length: int | None) -> Tensor:
     vector = _numbers(name, values)
+    if vector.ndim == 2 and 1 in vector.shape:
+        vector = vector.flatten()
     if vector.ndim != 1 or (length is not None and len(vector) != length):
         wanted = "a list of numbers" if length is None else f"{length} numbers"
         raise CameraError(f"{name} must be {wanted}, got shape {list(vector.shape)}")
@@ -379,6 +375,26 @@ def _vector(name: str, values: Any, length: int | None) -> Tensor:
             f"{name} must be finite and at most {_FARTHEST:g}, got {vector.tolist()!s:.200}"
         )
     return vector
+
+
+def _turn(name: str, values: Any) -> Tensor:
+    """Return the Rodrigues vector [3] of one, or of a rotation matrix."""
+    numbers = _numbers(name, values)
+    if tuple(numbers.shape) == (3, 3):
+        off = (numbers @ numbers.mT - torch.eye(3).to(numbers)).abs().max()
+        if not (float(off) < _NOT_SQUARE and float(torch.linalg.det(numbers)) > 0):
+            raise CameraError(
+                f"{name} must be a rotation, whose rows are of length 1 and at right angles, with the "
+                f"determinant 1, got {numbers.tolist()}"
+            )
+        return matrix_to_rotvec(numbers)
+    turn = _vector(name, values, 3)
+    if float(turn.norm()) > _LARGEST_TURN:
+        raise CameraError(
+            f"{name} must be a Rodrigues vector in radians of at most "
+            f"{_LARGEST_TURN:g}, got {turn.tolist()}; give degrees as radians"
+        )
+    return turn
 
 
 def _direction(name: str, up: Any) -> Tensor | None:
@@ -418,10 +434,8 @@ def _image_side(name: str, value: Any) -> int | None:
 
 
 def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> PinholeCamera:
-    if "matrix" not in table:
-        raise CameraError(f"{where}: a camera needs `matrix` (3 x 3, pixels), got {sorted(table)}")
     size = table.get("size", (None, None))
-    _check_keys(where, table)
+    check_keys(where, table)
     try:
         if not isinstance(size, Sequence) or len(size) != 2:
             raise CameraError(f"size must be [width, height], got {size!r:.60}")
@@ -441,28 +455,13 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
         raise CameraError(f"{where}: {error}") from error
 
 
-def _check_keys(where: str, table: Mapping[str, Any]) -> None:
-    """Raise `CameraError` for a key that is misspelt: what it says would not count."""
-    for key in table:
-        meant = get_close_matches(key.lower(), _KEYS, 1, _ALIKE)
-        if key not in _KEYS and meant:
-            raise CameraError(f"{where}: expected `{meant[0]}`, got `{key}`")
-
-
-def _toml_string(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
-
-
 def _camera_to_toml(name: str, camera: PinholeCamera) -> str:
-    header = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml_string(name)
-    lines = [f"[{header}]", f"name = {_toml_string(name)}"]
+    table: dict[str, Any] = {}
     if camera.image_size is not None:
-        lines.append(f"size = {[float(s) for s in camera.image_size]}")
+        table["size"] = [float(s) for s in camera.image_size]
     for key in ("matrix", "distortions", "rotation", "translation"):
-        # repr of a Python float is the shortest text that reads back to the same number
-        lines.append(f"{key} = {getattr(camera, key).double().tolist()}")
-    lines.append(f"fisheye = {str(camera.fisheye).lower()}")
+        table[key] = getattr(camera, key).double().tolist()
+    table["fisheye"] = camera.fisheye
     if camera.up is not None:
-        lines.append(f"up = {camera.up.double().tolist()}")
-    return "\n".join(lines) + "\n"
+        table["up"] = camera.up.double().tolist()
+    return table_text(name, table)

@@ -253,10 +253,12 @@ def _describe_recordings(path: Path) -> str:
 
 
 def _describe_cameras(path: Path) -> str:
-    from torchpose.camera._pinhole import load_cameras
+    from torchpose.camera._pinhole import read_cameras
     from torchpose.cli._track_output import camera_text
 
-    return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})
+    cameras, notes = read_cameras(path)
+    rows = {name: camera_text(camera) for name, camera in cameras.items()}
+    return _table({**rows, "note": "\n".join(notes)})
 
 
 def _holds_recordings(path: Path) -> bool:

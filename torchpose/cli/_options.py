@@ -46,6 +46,11 @@ class Option(NamedTuple):
         return f"--{self.key.replace('_', '-')}"
 
     @property
+    def is_list(self) -> bool:
+        """Return whether the value is a list."""
+        return any(_is_list(part) for part in (self.kind, *typing.get_args(self.kind)))
+
+    @property
     def metavar(self) -> str:
         """Return the placeholder: choices, a letter for a number, a name, or a list of these."""
         words = _words(self.kind)

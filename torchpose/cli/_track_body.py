@@ -179,10 +179,10 @@ def run(
     check_values(given.values)
     refuse_unsuited(given, by_keypoints)
     share_cores()
-    found = _cameras(cameras, camera_names, len(inputs))
+    found, notes = _cameras(cameras, camera_names, len(inputs))
     job = BodyJob(
         out, given.files(), tuple(dict.fromkeys(formats or ())), up, overlay,
-        pictures_possible(pictures),
+        pictures_possible(pictures), notes,
     )  # fmt: skip
     options = {"sharpness": sharpness, **method_options}
     options = {name: value for name, value in options.items() if value is not None}
@@ -215,7 +215,7 @@ def run(
         facts = _facts(given, body_tracker, recordings, poses, seconds)
         shown += write_page(recordings.views[0].source, [poses], facts, results.stage)
         written += results.commit(shown)
-    return summary([poses], facts, written, results.notes)
+    return summary([poses], facts, written, [*job.notes, *results.notes])
 
 
 def _run_on_keypoints(
@@ -272,10 +272,13 @@ def _facts(
     return {name: fact for name, fact in facts.items() if fact}
 
 
-def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[PinholeCamera]":
-    from torchpose.camera._pinhole import camera_of_name, list_names, load_cameras
+def _cameras(
+    file: str, names: list[str] | None, n_inputs: int
+) -> "tuple[list[PinholeCamera], tuple[str, ...]]":
+    """Return the cameras of the inputs, and notes on the file."""
+    from torchpose.camera._pinhole import camera_of_name, list_names, read_cameras
 
-    cameras = load_cameras(file)
+    cameras, notes = read_cameras(file)
     names = list(cameras) if names is None else names
     found = [camera_of_name(cameras, name) for name in names]
     if None in found or len(names) != n_inputs:
@@ -283,7 +286,7 @@ def _cameras(file: str, names: list[str] | None, n_inputs: int) -> "list[Pinhole
             f"{file}: expected a camera for each of the {n_inputs} inputs, got {', '.join(names)}; "
             f"it holds {list_names(cameras)} (choose by --camera-names)"
         )
-    return [camera for camera in found if camera is not None]
+    return [camera for camera in found if camera is not None], notes
 
 
 def _models(

@@ -132,7 +132,7 @@ def track_keypoints(
             drawn += _write_skeletons(stage, people, cameras[0])
         facts = _facts(keypoints, settings, people, seconds)
         written += results.commit([*drawn, *write_page(cameras[0], people, facts, stage)])
-    return summary(people, facts, written, [*short, *results.notes])
+    return summary(people, facts, written, [*job.notes, *short, *results.notes])
 
 
 def _nobody(keypoints: BodyKeypoints) -> str:

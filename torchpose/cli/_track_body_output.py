@@ -33,7 +33,7 @@ class BodyJob(NamedTuple):
     Attributes:
         out: folder of the results. files: that the command reads.
         formats: suffixes of further files of the poses. up: the axis that points up, None if it is not told.
-        overlay, pictures: whether a video per camera, and pictures, are wanted.
+        overlay, pictures: whether a video per camera, and pictures, are wanted. notes: on the cameras.
     """
 
     out: str
@@ -42,6 +42,7 @@ class BodyJob(NamedTuple):
     up: str | None
     overlay: bool
     pictures: bool
+    notes: tuple[str, ...] = ()
 
 
 def body_results(
