@@ -13,7 +13,6 @@ from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._following import Observed
-from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS
@@ -105,10 +104,10 @@ class BodyKeypointMeasurer:
         It is that of the first frame with enough joints in any camera.
 
         Raises:
-            NobodySeenError: there is none. CameraError: cameras that are not in metres.
+            NobodySeenError: there is none. CameraError: cameras of another convention or unit.
         """
         batch = frames.map(lambda value: value[None])
-        check_units(self.tracker.tracker.filter, batch)
+        self.tracker.check_cameras(batch)
         poses = self.tracker.tracker(batch, smoothing=True, waited=math.inf)
         if not bool(poses.started.any()):
             raise NobodySeenError(

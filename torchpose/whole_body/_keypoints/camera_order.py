@@ -4,40 +4,54 @@ from collections.abc import Sequence
 from itertools import combinations, permutations
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from torchpose.whole_body._keypoints.joint_triangulation import agreeing
+from torchpose.whole_body._keypoints.joint_triangulation import agreement_of_each
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
 _FRAMES = 20  # that are looked at, at most
 _EVERY_ORDER = 4  # cameras, of which every order is tried; of more, exchanges of two
-_AGREED = 0.7  # share of the keypoints that cameras have to agree on in another order
-_MORE = 0.25  # by how much that is more than in the order of the inputs, and in any other
+WELL = 0.8
+"""Agreement that another reading of what was given has to reach."""
+MORE = 0.08
+"""By how much this is more than as it was given."""
 
 
 def notes_on_order(names: Sequence[str], maps: RigMaps, frames: KeypointFrame) -> tuple[str, ...]:
-    """Return a note if keypoints agree far better in another order of the inputs.
+    """Return a note if cameras agree far better in another order of the inputs.
 
     Args:
         names: of the cameras. maps: of them. frames: keypoints [T, C, J].
     """
-    count = len(names)
-    orders = list(permutations(range(count))) if count <= _EVERY_ORDER else _exchanges(count)
     stride = max(1, -(-len(frames.pixels) // _FRAMES))
-    some = frames.map(lambda value: value[::stride])
-    tried = some.map(lambda value: value[:, torch.tensor(orders)].flatten(0, 1))
-    agreed = agreeing(maps, tried).unflatten(0, (-1, len(orders))).sum((0, 2, 3))
-    share = agreed / (some.inlier > 0).sum().clamp_min(1)
-    first, second = share.topk(2).values.tolist()
-    best = int(share.argmax())
-    known = first > max(_AGREED, share[0] + _MORE) and (best > 0) and first > second + _MORE / 2
-    if not known:
+    orders, agreed = agreement_of_orders(maps, frames.map(lambda value: value[::stride]))
+    first, second = agreed.topk(2).values.tolist()
+    best = int(agreed.argmax())
+    if best == 0 or first < max(WELL, agreed[0] + MORE):
         return ()
-    fits = ", ".join(f"input {orders[best][c] + 1} is of {names[c]}" for c in range(count))
+    fits = ", ".join(f"input {orders[best][c] + 1} is of {names[c]}" for c in range(len(names)))
+    several = ", hardly less in others," if first < second + MORE / 2 else ""
     return (
         f"inputs seem to be in another order than the cameras: cameras agree on {100 * first:.0f} % of the "
-        f"keypoints if {fits}, and on {100 * float(share[0]):.0f} % as they are given; give them in the "
+        f"keypoints if {fits}{several} and on {100 * float(agreed[0]):.0f} % as they are given; give them in the "
         "order of the cameras",
     )
+
+
+def agreement_of_orders(
+    maps: RigMaps, some: KeypointFrame
+) -> tuple[list[tuple[int, ...]], Float[Tensor, " N"]]:
+    """Return the orders of inputs that are tried, the given one first, and how well cameras agree in each.
+
+    Args:
+        maps: the cameras. some: keypoints [T, C, J] of some frames.
+    """
+    count = some.pixels.shape[1]
+    orders = list(permutations(range(count))) if count <= _EVERY_ORDER else _exchanges(count)
+    tried = some.map(lambda value: value[:, torch.tensor(orders)].flatten(0, 1))
+    good, seen = (v.unflatten(0, (-1, len(orders))).sum(0) for v in agreement_of_each(maps, tried))
+    return orders, good / seen.clamp_min(1)
 
 
 def _exchanges(count: int) -> list[tuple[int, ...]]:

@@ -29,7 +29,7 @@ def check_units(filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
     """
     stride = max(1, frames.pixels.shape[1] // _FRAMES)
     some = frames.map(lambda value: value[:, ::stride].flatten(0, 1))
-    logs = _log_factors(filter.maps, some, filter.motion)
+    logs = log_factors(filter.maps, some, filter.motion)
     if len(logs) < _LEAST_BONES:
         return
     factor = math.exp(float(logs.median()))
@@ -41,8 +41,12 @@ def check_units(filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
         )
 
 
-def _log_factors(maps: RigMaps, frame: KeypointFrame, motion: BodyMotion) -> Tensor:
-    """Return the logs of lengths of bones in images by those that are expected; none if cameras disagree."""
+def log_factors(maps: RigMaps, frame: KeypointFrame, motion: BodyMotion) -> Tensor:
+    """Return the logs of lengths of bones in images by those that are expected; none if cameras disagree.
+
+    Args:
+        maps: the cameras. frame: keypoints [B, C, J]. motion: of the person who is expected.
+    """
     joints, there = triangulate(maps, frame), frame.inlier > 0
     agreed = joints.isfinite().all(-1)
     if int(agreed.sum()) < _AGREED * int((there.sum(1) >= 2).sum()):

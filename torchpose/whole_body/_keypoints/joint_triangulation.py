@@ -3,7 +3,7 @@
 from itertools import combinations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
@@ -50,6 +50,32 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
         chosen = torch.where((score > best)[:, None], agree, chosen)
         best = torch.maximum(best, score)
     return chosen
+
+
+def agreement(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, ""]:
+    """Return how well cameras agree on joints, from 0 to 1.
+
+    It is the mean of 1 - e^2 / 36 over all keypoints of joints that two cameras see or more. e is the distance
+    from the joint of all that agree, in standard deviations of the noise. Of those that do not agree 0 counts.
+
+    Args:
+        maps: the cameras. frame: the keypoints.
+    """
+    good, count = agreement_of_each(maps, frame)
+    return good.sum() / count.sum().clamp_min(1)
+
+
+def agreement_of_each(
+    maps: RigMaps, frame: KeypointFrame
+) -> tuple[Float[Tensor, " B"], Int[Tensor, " B"]]:
+    """Return the sums of `agreement` of each element of the batch, and the numbers of its keypoints."""
+    chosen, there = agreeing(maps, frame), frame.inlier > 0
+    seen = see(maps, triangulate_all(maps, frame, chosen))
+    variance = frame.variance + frame.relative * seen.by_joint.square().sum((-2, -1)) / 2
+    error = (seen.pixels - frame.pixels).square().sum(-1) / variance
+    good = torch.where(chosen, (1 - error / _AGREE**2).clamp_min(0), 0.0)
+    both = there & (there.sum(1, keepdim=True) >= 2)
+    return torch.where(both, good, 0.0).sum((1, 2)), both.sum((1, 2))
 
 
 def triangulate_all(

@@ -30,6 +30,7 @@ from torchpose.priors._foot_prior import shipped_foot_prior
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.camera_conventions import check_conventions
 from torchpose.whole_body._keypoints.camera_notes import (
     doubt_cameras,
     notes_on_cameras,
@@ -189,7 +190,7 @@ class KeypointBodyTracker(nn.Module):
         if single:
             frames = frames.map(lambda value: value[None])
             feet = None if feet is None else feet.map(lambda value: value[None])
-        check_units(self.tracker.filter, frames)
+        self.check_cameras(frames)
         begun = self.first_frames(frames)
         if refine != "none":
             frames = frames.map(lambda value: value[:, begun[0] :])
@@ -245,6 +246,15 @@ class KeypointBodyTracker(nn.Module):
         return track_feet(self.feet, self.tracker.filter.maps, poses, frames, smoothing)
 
     # --- cameras ----------------------------------------------------------------------------------
+
+    def check_cameras(self, frames: KeypointFrame) -> None:
+        """Raise `CameraError` for cameras of another convention or unit.
+
+        Args:
+            frames: keypoints [B, T, C, J].
+        """
+        check_conventions(self.rig, self.tracker.filter, frames)
+        check_units(self.tracker.filter, frames)
 
     def _check_refine(self, refine: str, keypoints: Tensor) -> None:
         """Refuse to refine what one camera or several recordings do not tell."""

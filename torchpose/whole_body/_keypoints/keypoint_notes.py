@@ -231,8 +231,15 @@ def notes_on_a_rolled_camera(
     trunk = _lean(pixels, there, "neck", ("left_hip", "right_hip"))
     legs = _lean(pixels, there, "pelvis", ("left_ankle", "right_ankle"))
     leans = min(abs(trunk), abs(legs))
-    if trunk * legs <= 0 or leans < _LEANS:
+    upside_down = leans > 90
+    if leans < _LEANS or (trunk * legs <= 0 and not upside_down):
         return ()
+    if upside_down:
+        return (
+            f"the person is upside down in most images of camera {name}, which is taken to be level since no "
+            "up is given; v of keypoints is to be counted downwards from the upper edge of an image. If the "
+            "camera hangs that way, give up (--up), the axis of the world that points up, or turn the images",
+        )
     return (
         f"the person leans by {leans:.0f} degrees or more in most images of camera {name}, which is taken "
         "to be level since no up is given; if the camera is rolled, or its video turned, give up (--up), the "

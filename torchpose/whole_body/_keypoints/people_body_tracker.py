@@ -12,6 +12,7 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.camera_conventions import check_conventions
 from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.foot_filter import FootGaussian, FootPoses
 from torchpose.whole_body._keypoints.foot_tracker import continued, step_feet
@@ -108,9 +109,9 @@ class PeopleBodyTracker:
         persons = [_until_last_seen(of_one) for of_one in rows.values()]
         identities = [int(one[-1].frame.identity[one[-1].row]) for one in persons]
         named = sorted((who, i) for i, who in enumerate(identities) if who > 0)
-        self._check_units([row for _, i in named for row in persons[i]])
+        self._check_cameras([row for _, i in named for row in persons[i]])
         if not named:
-            self._check_units_of_pairs(frames)
+            self._check_cameras_of_pairs(frames)
         return [self._track(persons[i], who, feet, smoothing == "full") for who, i in named]
 
     @torch.no_grad()
@@ -168,16 +169,17 @@ class PeopleBodyTracker:
         assert body is not None
         return body, feet
 
-    def _check_units(self, rows: Sequence[_Row]) -> None:
-        """Raise `CameraError` where cameras are not in metres, by the bones of all persons together."""
+    def _check_cameras(self, rows: Sequence[_Row]) -> None:
+        """Raise `CameraError` for cameras of another convention or unit, by the keypoints of all persons."""
         if rows:
             seen = [taken(one.frame.keypoints, torch.tensor([one.row])) for one in rows]
-            check_units(self.single.tracker.filter, stacked(seen))
+            self.single.check_cameras(stacked(seen))
 
-    def _check_units_of_pairs(self, frames: KeypointFrame) -> None:
-        """Raise `CameraError` where nobody is found since cameras are not in metres.
+    def _check_cameras_of_pairs(self, frames: KeypointFrame) -> None:
+        """Raise `CameraError` where nobody is found since cameras are of another convention or unit.
 
-        Any two detections of two cameras that agree on joints are taken for a person's.
+        Conventions are told where no camera has more than one detection. Any two detections of two cameras
+        that agree on joints are taken for a person's, whose bones tell the unit.
 
         Args:
             frames: [T, D, C, J].
@@ -185,6 +187,13 @@ class PeopleBodyTracker:
         filter = self.single.tracker.filter
         if len(filter.maps.shift) == 1:
             return
+        there = (frames.inlier > 0).any(-1)
+        single = (there.sum(1) <= 1).all(-1)
+        cameras = torch.arange(there.shape[2])
+        first = there[single].int().argmax(1)
+        rows = torch.arange(len(first))[:, None]
+        of_one = frames.map(lambda value: value[single][rows, first, cameras][None])
+        check_conventions(self.single.rig, filter, of_one)
         stride = max(1, len(frames.pixels) // _FRAMES)
         pairs = [
             pairs_of_detections(frames.map(lambda value: value[t]))  # noqa: B023

@@ -1,0 +1,211 @@
+"""Refuse cameras and keypoints of another convention, in which cameras agree far better on the person.
+
+Poses from camera to world, axes of other programs and images that were scaled or turned give poses of a
+person who is somewhere else, upside down or turned about, and some of them agree not badly. So the known
+conventions are tried on some frames. What decides is how well cameras agree on the joints (`agreement`) in
+one in which the person has the size of one.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.body._skeleton import BODY_15
+from torchpose.camera._rig import CameraRig
+from torchpose.errors import CameraError
+from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
+from torchpose.whole_body._keypoints.camera_order import MORE, WELL, agreement_of_orders
+from torchpose.whole_body._keypoints.camera_units import log_factors
+from torchpose.whole_body._keypoints.joint_triangulation import agreement
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+
+_FRAMES = 12  # that are looked at, at most
+_LEAST_KEYPOINTS = 40  # in these frames, of joints that two cameras see
+_LEAST_BONES = 20  # in all images, that tell a size
+_SURE = 0.92  # agreement from which on nothing else is tried, unless the person is upside down
+_WELL_OF_TWO = (
+    0.9  # agreement of two cameras, which is easier, that another convention has to reach
+)
+_UPSIDE_DOWN = 0.8  # share of images in which the neck is below the pelvis
+_LITTLE = 0.02  # by how much cameras have to agree better on one who is not upside down
+_SIZES = (0.4, 1.6)  # of a person, by what is expected
+_MOST = 0.99  # share of the keypoints that is in the images
+_SCALES = ((1, 3), (1, 2), (2, 3), (3, 2), (2, 1), (3, 1))  # of images by the calibrated ones
+
+_Pixels = Callable[[Tensor], Tensor]
+
+
+class _Convention(NamedTuple):
+    """Holds another reading of what is given.
+
+    Attributes:
+        said: in which cameras agree, after "if". advice: what to do.
+        rotation, translation: of the cameras [C, 3, 3], [C, 3].
+        pixels: the change of keypoints [..., C, J, 2].
+        upright: whether one who was upside down in images is upright in them.
+    """
+
+    said: str
+    advice: str
+    rotation: Tensor
+    translation: Tensor
+    pixels: _Pixels | None = None
+    upright: bool = False
+
+
+def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
+    """Raise `CameraError` where cameras agree far better on the person in another convention.
+
+    Args:
+        rig: the cameras. filter: of the person whose bones are expected. frames: keypoints [B, T, C, J].
+    """
+    if len(rig) == 1:
+        return
+    flat = frames.map(lambda value: value.flatten(0, 1))
+    told = (flat.inlier > 0).any(-1).sum(-1) >= 2
+    rows = told.nonzero().squeeze(-1)
+    rows = rows[:: max(1, -(-len(rows) // _FRAMES))]
+    some = flat.map(lambda value: value[rows])
+    both = (some.inlier > 0) & ((some.inlier > 0).sum(1, keepdim=True) >= 2)
+    if int(both.sum()) < _LEAST_KEYPOINTS:
+        return
+    given = float(agreement(filter.maps, some))
+    human = _is_human(filter, filter.maps, some)
+    upside_down = _is_upside_down(some)
+    if human and given > _SURE and not upside_down:
+        return
+    found = []
+    least = _WELL_OF_TWO if len(rig) == 2 else WELL
+    for convention in (*_conventions(rig), *_of_sizes(rig, some)):
+        maps = _maps(rig, filter.maps, convention.rotation, convention.translation)
+        moved = some
+        if convention.pixels is not None:
+            moved = some._replace(pixels=convention.pixels(some.pixels))
+        fits = float(agreement(maps, moved))
+        more = _LITTLE if upside_down and convention.upright else MORE
+        if fits > max(least, given + more if human else 0.0) and _is_human(filter, maps, moved):
+            found.append((fits, convention))
+    if not found:
+        return
+    best, convention = max(found, key=lambda pair: pair[0])
+    if float(agreement_of_orders(filter.maps, some)[1].max()) > best:
+        return  # a note tells of the order
+    raise CameraError(
+        f"cameras agree on {100 * given:.0f} % of the keypoints as they are given, and on {100 * best:.0f} % "
+        f"if {convention.said}; {convention.advice}"
+    )
+
+
+def _is_human(filter: BodyKalmanFilter, maps: RigMaps, some: KeypointFrame) -> bool:
+    """Return whether bones are about as long as those of a person, or too few tell."""
+    logs = log_factors(maps, some, filter.motion)
+    return len(logs) < _LEAST_BONES or _SIZES[0] < math.exp(float(logs.median())) < _SIZES[1]
+
+
+def _is_upside_down(some: KeypointFrame) -> bool:
+    """Return whether the neck is below the pelvis in most images."""
+    ends = [BODY_15.joint("neck"), BODY_15.joint("pelvis")]
+    both = (some.inlier[..., ends] > 0).all(-1)
+    neck, pelvis = some.pixels[..., ends, 1][both].unbind(-1)
+    return len(neck) > 0 and float((neck > pelvis).double().mean()) > _UPSIDE_DOWN
+
+
+def _maps(rig: CameraRig, maps: RigMaps, rotation: Tensor, translation: Tensor) -> RigMaps:
+    """Return the maps of cameras with other poses."""
+    matrix = rig.matrix.to(maps.matrix)
+    shift = (matrix @ translation[..., None]).squeeze(-1)
+    turned = matrix @ rotation
+    return maps._replace(matrix=turned, shift=shift, centre=-torch.linalg.solve(turned, shift))
+
+
+def _conventions(rig: CameraRig) -> Iterator[_Convention]:
+    """Yield all known conventions but the own one."""
+    R, t = rig.rotation, rig.translation
+    yield from _of_poses(R, t)
+    yield _Convention(
+        "keypoints are v, u, a row and a column", "give u, v: u to the right and v down", R, t,
+        lambda pixels: pixels.flip(-1),
+    )  # fmt: skip
+    if None in rig.sizes:
+        return
+    h, w = torch.tensor(rig.sizes).to(R).T[..., None]
+    yield _Convention(
+        "v is counted from the lower edge of the image", "give height - 1 - v, which is down", R, t,
+        lambda p: torch.stack([p[..., 0], h - 1 - p[..., 1]], -1), True,
+    )  # fmt: skip
+    yield _Convention(
+        "the images are mirrored",
+        "give keypoints of images as they were calibrated, u = width - 1 - u (and exchange left and right if "
+        "a detector found them in mirrored images)",
+        R, t, lambda p: torch.stack([w - 1 - p[..., 0], p[..., 1]], -1),
+    )  # fmt: skip
+    turns: dict[str, _Pixels] = {
+        "upside down": lambda p: torch.stack([w - 1 - p[..., 0], h - 1 - p[..., 1]], -1),
+        "turned by 90 degrees clockwise": lambda p: torch.stack([p[..., 1], h - 1 - p[..., 0]], -1),
+        "turned by 90 degrees counterclockwise": lambda p: torch.stack(
+            [w - 1 - p[..., 1], p[..., 0]], -1
+        ),
+    }
+    for turn, pixels in turns.items():
+        yield _Convention(
+            f"the images are {turn} against the calibrated ones",
+            "turn the images, or their keypoints, back, or calibrate the turned images",
+            R, t, pixels, turn == "upside down",
+        )  # fmt: skip
+
+
+def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[_Convention]:
+    """Yield the sizes of images in which keypoints can be: all lie inside, and in no smaller image of these.
+
+    Two cameras close together tell sizes poorly, so only those that the keypoints themselves speak for count.
+    """
+    if None in rig.sizes:
+        return
+    sides = torch.tensor(rig.sizes).to(some.pixels).flip(-1)[:, None]
+    used = float((some.pixels / sides).amax(-1)[some.inlier > 0].quantile(_MOST))
+    for one, of in _SCALES:
+        s = one / of
+        if (s < 1 and used > s) or (s > 1 and used < 1):
+            continue
+        yield _Convention(
+            f"keypoints are of images of {one}/{of} of the calibrated size",
+            f"give the calibration of these images: the first two rows of `matrix` and `size` times {one}/{of}"
+            ", or give keypoints of the calibrated images (.npz and .csv may state image_size)",
+            rig.rotation, rig.translation, lambda pixels, s=s: (pixels + 0.5) / s - 0.5,
+        )  # fmt: skip
+
+
+def _of_poses(R: Float[Tensor, "C 3 3"], t: Float[Tensor, "C 3"]) -> Iterator[_Convention]:
+    """Yield the conventions of poses R, t of cameras."""
+    flip = torch.tensor([1.0, -1.0, -1.0]).to(R)
+
+    def moved(turn: Tensor, point: Tensor) -> Tensor:
+        return -(turn @ point[..., None]).squeeze(-1)
+
+    opengl = "cameras look along -z with y up, as those of OpenGL and Blender"
+    yield _Convention(
+        "poses are those from camera to world",
+        "a camera file has those from world to camera: the rotation R^T and the translation -R^T t",
+        R.mT, moved(R.mT, t),
+    )  # fmt: skip
+    yield _Convention(
+        "translations are the places of the cameras", "a camera at c has the translation -R c", R,
+        moved(R, t),
+    )  # fmt: skip
+    yield _Convention(
+        "rotations are those from camera to world, and translations are not",
+        "give the rotations R^T, of Rodrigues vectors with the other sign", R.mT, t,
+    )  # fmt: skip
+    yield _Convention(
+        opengl, "give the rotation F R and the translation F t, with F = diag(1, -1, -1)",
+        flip[:, None] * R, flip * t,
+    )  # fmt: skip
+    yield _Convention(
+        f"{opengl}, and poses are those from camera to world",
+        "give the rotation F R^T and the translation -F R^T t, with F = diag(1, -1, -1)",
+        flip[:, None] * R.mT, moved(flip[:, None] * R.mT, t),
+    )  # fmt: skip
