@@ -71,6 +71,21 @@ def test_coordinates_that_are_no_pixels(tmp_path):
     assert len(read_keypoints(write(tmp_path / "c.npz", keypoints=shares[:1]))) == 1  # two: too few
 
 
+def test_shares_of_an_image_of_known_size_are_multiplied(tmp_path):
+    size = np.array([640, 480])
+    shares = points() / size
+    for name, stated, known in (("a", {"image_size": size}, None), ("b", {}, (640, 480))):
+        read = read_keypoints(write(tmp_path / f"{name}.npz", keypoints=shares, **stated), known)
+        torch.testing.assert_close(read.keypoints, torch.from_numpy(points()))
+        assert read.notes == (
+            "keypoints between 0 and 1 are multiplied by the 640 x 480 pixels of the image",
+        )
+    with pytest.raises(FileFormatError, match="must be in pixels"):  # from -1 to 1
+        read_keypoints(write(tmp_path / "c.npz", keypoints=2 * shares - 1), (640, 480))
+    in_pixels = read_keypoints(write(tmp_path / "d.npz"), (320, 240))
+    torch.testing.assert_close(in_pixels.keypoints, torch.from_numpy(points()))
+
+
 def test_peaks_above_one_count_as_one(tmp_path):
     read = read_keypoints(
         write(tmp_path / "a.npz", keypoints=points(), confidence=np.full((5, 3), 1.3))
@@ -83,8 +98,11 @@ def test_zeros_are_missing(tmp_path):
     zeros[2, 1] = 0
     read = read_keypoints(write(tmp_path / "a.npz", keypoints=zeros))
     assert (~read.measured).nonzero().tolist() == [[2, 1]]
-    assert read.notes == ("1 keypoints at exactly (0, 0) count as missing",)
-    confidence = np.where((zeros == 0).all(-1), 0.0, 1.0)
+    assert read.notes == ("1 keypoints at exactly (0, 0) or (-1, -1) count as missing",)
+    zeros[2, 1] = -1
+    read = read_keypoints(write(tmp_path / "d.npz", keypoints=zeros))
+    assert (~read.measured).nonzero().tolist() == [[2, 1]]
+    confidence = np.where((zeros == -1).all(-1), 0.0, 1.0)
     assert not read_keypoints(
         write(tmp_path / "b.npz", keypoints=zeros, confidence=confidence)
     ).notes
@@ -274,8 +292,8 @@ def test_visibility_of_arrays_is_the_confidence_where_there_is_none(tmp_path):
             "delete or rename a_visibility",
         ),
         (
-            ["frame,time,head_x,head_y,a,b,c", "0,1,2,3,4,5,6"],
-            "rename time, a, b and 1 more .*# fps",
+            ["frame,e,head_x,head_y,a,b,c", "0,1,2,3,4,5,6"],
+            "rename e, a, b and 1 more .*# fps",
         ),
         (["frame,head_x,head_y,head_x", "0,1,2,3"], "each once"),
         (["frame,x1,y1,z1,v1,x2,y2,z2,v2", "0,1,2,3,4,5,6,7,8"], "got frame, x1, y1 and 6 more$"),
@@ -296,6 +314,40 @@ def test_bad_rows(tmp_path, lines, word):
     with pytest.raises(FileFormatError, match=word) as caught:
         read_keypoints(text(tmp_path, *lines))
     assert "clip.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("lines", "left_out"),
+    [
+        (["frame,a_x,a_y,a_z,a_visibility", "3,10,20,-0.4,0.5"], "a_z"),
+        (["timestamp,frame_number,a_x,a_y,a_z,a_confidence", "0.1,3,10,20,5,0.5"], "timestamp, a_z"),
+        (["frame_idx,a_x,a_y,a_presence,a_score", "3,10,20,1,0.5"], "a_presence"),
+        (["frame,name,x,y,z,visibility", "3,a,10,20,0.1,0.5"], "z"),
+        (["frame,timestamp_ms,landmark,x,y,z,score", "3,100,a,10,20,7,0.5"], "timestamp_ms, z"),
+    ],
+)  # fmt: skip
+def test_depths_and_times_of_tables_are_passed_over(tmp_path, lines, left_out):
+    read = read_keypoints(text(tmp_path, *[line.replace("a", "head") if i else line.replace("a_", "head_")
+                                           for i, line in enumerate(lines)]))  # fmt: skip
+    assert read.names == ("head",) and read.first_frame == 3
+    assert read.keypoints.tolist() == [[[10.0, 20.0]]]
+    assert read.confidence is not None and read.confidence.tolist() == [[0.5]]
+    (note,) = read.notes
+    assert f"columns {left_out.replace('a_', 'head_')} are passed over" in note
+
+
+def test_numbers_of_landmarks_are_mediapipes(tmp_path):
+    rows = [f"0,{i},{0.3 + 0.01 * i},0.5,0,0.9" for i in range(33)]
+    path = text(tmp_path, "# image_size = 1000,500", "frame,landmark,x,y,z,visibility", *rows)
+    read = read_keypoints(path)
+    assert read.names[:33] == LANDMARKS
+    assert read.keypoints[0, 12].tolist() == pytest.approx([420.0, 250.0])
+
+
+def test_points_in_space_are_no_keypoints(tmp_path):
+    rows = [f"{i},{300 * (-1) ** i},900,1200" for i in range(9)]
+    with pytest.raises(FileFormatError, match="points in space"):
+        read_keypoints(text(tmp_path, "frame,head_x,head_y,head_z", *rows))
 
 
 def test_rows_without_measurements(tmp_path):

@@ -142,7 +142,10 @@ def read_body_keypoints(
     """
     from torchpose.camera._choice import fit_to_size
 
-    parts = [_read(path, detector, fps, everybody) for path in inputs]
+    parts = [
+        _read(path, detector, fps, everybody, camera.image_size)
+        for path, camera in zip(inputs, cameras, strict=True)
+    ]
     fitted = [
         fit_to_size(camera, part.size, path)
         for camera, part, path in zip(cameras, parts, inputs, strict=True)
@@ -253,19 +256,26 @@ def _padded(values: Tensor, most: int, joints: int, missing: float) -> Tensor:
 
 
 def _read(
-    path: str, detector: DetectorSettings | None, fps: float | None, everybody: bool
+    path: str,
+    detector: DetectorSettings | None,
+    fps: float | None,
+    everybody: bool,
+    size: tuple[int, int] | None,
 ) -> CameraKeypoints:
+    """Read one camera, whose images were calibrated with a size."""
     if detector is not None and is_video(path):
         return _detect(path, detector, fps, everybody)
     from torchpose.io._formats.openpose import read_openpose_people
-    from torchpose.io._keypoints import read_keypoints
+    from torchpose.io._keypoints import in_pixels, is_filled, read_keypoints
 
     if everybody and Path(path).is_dir():
         people = read_openpose_people(path)
-        table, trust = (torch.from_numpy(value) for value in (people.keypoints, people.confidence))
-        of_body = _of_body(path, table, trust, people.names)
-        return CameraKeypoints(*of_body, None, None, first=people.first)
-    found = read_keypoints(path)
+        missing = is_filled(people.keypoints) | ~(people.confidence > 0)
+        table, notes = in_pixels(Path(path), people.keypoints, missing, size)
+        trust = torch.from_numpy(people.confidence).masked_fill(torch.from_numpy(missing), 0.0)
+        of_body = _of_body(path, torch.from_numpy(table), trust, people.names)
+        return CameraKeypoints(*of_body, None, None, notes, first=people.first)
+    found = read_keypoints(path, size)
     points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
     derived = count_given(found.names) < len(found.names)  # joints that are not used here
     notes = found.notes[:-1] if derived else found.notes

@@ -276,12 +276,13 @@ def _holds_recordings(path: Path) -> bool:
 def _starts_as_keypoints(path: Path) -> bool:
     """Return whether a table begins with a header, as keypoints do and recordings of a Kinect do not."""
     from torchpose._core.reading import reading, require_file
+    from torchpose.io._formats.keypoint_files import FRAME_COLUMNS
 
     path = require_file(path)
     with reading(path, "a table"), path.open(encoding="utf-8-sig", errors="replace") as stream:
         lines = stream.read(_SNIFFED).splitlines()
     first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    return first.lower().startswith("frame")
+    return any(cell.strip().lower() in FRAME_COLUMNS for cell in first.split(","))
 
 
 def _length(n_frames: int, fps: float | None) -> str:

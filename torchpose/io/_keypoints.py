@@ -31,6 +31,7 @@ from torchpose.skeleton._upper_body import NECK_KINDS, neck_of_detectors
 
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
+_MOST = 0.8  # share of coordinates that lie between 0 and 1 if they are shares of the image
 
 
 @dataclass
@@ -87,7 +88,7 @@ def said_of_crowd(n_people: Tensor | None) -> str:
     )
 
 
-def read_keypoints(path: str | Path) -> Keypoints:
+def read_keypoints(path: str | Path, image_size: tuple[int, int] | None = None) -> Keypoints:
     """Read 2D keypoints of one person.
 
     ``.npz``: `keypoints` [T, J, 2] and `names` [J]; optionally `confidence` [T, J], `fps`, `K`
@@ -99,7 +100,10 @@ def read_keypoints(path: str | Path) -> Keypoints:
     long form ``frame,name,x,y[,confidence]`` with a row per keypoint. Empty cells and absent frames
     are missing. Lines ``# fps = 30`` and ``# image_size = 640,480`` may stand above the header.
 
-    In both, `visibility` is the confidence where there is none.
+    In both, `visibility` is the confidence where there is none. Columns of z and of times are passed over,
+    and a note says so. Frames, names and scores may be called otherwise, as MediaPipe's scripts do.
+
+    Keypoints that are shares of the image, from 0 to 1, are multiplied by its size where this is known.
 
     A folder: OpenPose's ``*_keypoints.json``, one per frame, of BODY_25, BODY_25B, COCO, Halpe, MediaPipe or
     COCO-WholeBody. Of several people, the most confident one is followed; see
@@ -107,6 +111,8 @@ def read_keypoints(path: str | Path) -> Keypoints:
 
     Args:
         path: file or folder.
+        image_size: (width, height) of the images, pixels, where the file does not state it; it counts for
+            keypoints that are shares of the image alone.
 
     Returns:
         `Keypoints` with [T, J, 2] in pixels, u to the right and v down.
@@ -119,7 +125,7 @@ def read_keypoints(path: str | Path) -> Keypoints:
     """
     path = Path(path)
     with reading(path, "keypoints"):
-        return _finish(path, _read(path))
+        return _finish(path, _read(path), image_size)
 
 
 def _read(path: Path) -> RawKeypoints:
@@ -196,7 +202,7 @@ def _to_csv(data: Keypoints) -> str:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
+def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -> Keypoints:
     points, names = raw.keypoints, raw.names
     if points.ndim != 3 or points.shape[1:] != (len(names), 2):
         raise FileFormatError(
@@ -215,7 +221,7 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         canonical_names(names)
     except SkeletonError as error:
         raise SkeletonError(f"{path}: {error}") from error
-    filled = (points == 0).all(-1)  # what many files have where nothing was found
+    filled = is_filled(points)
     missing = np.isnan(points).any(-1) | filled
     if raw.confidence is not None:
         confidence = _check_confidence(path, raw.confidence, points.shape[:2])
@@ -224,10 +230,9 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
         confidence = np.where(missing, 0.0, confidence)
     if missing.all():
         raise InputError(f"{path}: no keypoint is measured in any of {len(points)} frames")
-    try:
-        check_pixels("keypoints", torch.from_numpy(points), torch.from_numpy(~missing))
-    except InputError as error:
-        raise FileFormatError(f"{path}: {error}") from error
+    size = _check_size(path, raw.image_size)
+    points, scaled = in_pixels(path, points, missing, size or image_size)
+    notes = (*raw.notes, *scaled, *_note_of_filled(int(filled.sum())))
     try:
         fps = None if raw.fps is None else check_rate("fps", raw.fps)
     except InputError as error:
@@ -240,9 +245,9 @@ def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
     keypoints = Keypoints(
         torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
         None if raw.confidence is None else torch.from_numpy(confidence), fps,
-        _check_matrix(path, raw.K), _check_size(path, raw.image_size),
+        _check_matrix(path, raw.K), size,
         raw.neck or (neck_of_detectors(names) if skeleton is None else skeleton.neck), path,
-        notes=_note_of_filled(int(filled.sum())),
+        notes=notes,
         n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
         first_frame=raw.first_frame,
     )  # fmt: skip
@@ -264,8 +269,39 @@ def _with_joints(data: Keypoints) -> Keypoints:
     )
 
 
+def is_filled(points: np.ndarray) -> np.ndarray:
+    """Return which keypoints [..., 2] are (0, 0) or (-1, -1), what files have where nothing was found."""
+    return (points == 0).all(-1) | (points == -1).all(-1)
+
+
+def in_pixels(
+    path: Path, points: np.ndarray, missing: np.ndarray, size: tuple[int, int] | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return keypoints [..., 2] in pixels: shares of an image of known size are multiplied by it.
+
+    Args:
+        path: of the file, for messages. points: the keypoints. missing: which are none [...].
+        size: (width, height) of the images, None if it is not known.
+
+    Raises:
+        FileFormatError: they are no pixels, and the size is not known or they are no shares either.
+    """
+    try:
+        check_pixels("keypoints", torch.from_numpy(points), torch.from_numpy(~missing))
+    except InputError as error:
+        known = points[~missing]
+        if size is None or ((known >= 0) & (known <= 1)).mean() < _MOST:
+            raise FileFormatError(f"{path}: {error}") from error
+    else:
+        return points, ()
+    note = (
+        f"keypoints between 0 and 1 are multiplied by the {size[0]} x {size[1]} pixels of the image"
+    )
+    return points * np.array(size), (note,)
+
+
 def _note_of_filled(count: int) -> tuple[str, ...]:
-    return (f"{count} keypoints at exactly (0, 0) count as missing",) * (count > 0)
+    return (f"{count} keypoints at exactly (0, 0) or (-1, -1) count as missing",) * (count > 0)
 
 
 def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -18,9 +18,21 @@ from torchpose._core.reading import (
 )
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _SHOWN = 3  # columns that a message lists
 _TRUST = ("confidence", "visibility")  # names of it; MediaPipe's is the second
+_SCORES = (*_TRUST, "score", "likelihood")  # names of it in tables
+FRAME_COLUMNS = ("frame", "frame_number", "frame_index", "frame_idx", "frame_id", "sync_index")
+"""What the column of the frame is called, in small letters."""
+_NAMES = ("name", "keypoint", "landmark", "joint", "bodypart")
+_PASSED_OVER = (
+    "z",
+    "presence",
+)  # of keypoints, beside x and y; MediaPipe's depth is no measurement
+_TIMES = ("time", "timestamp", "timestamp_ms", "time_s", "frame_time")
+_LANDMARKS = 33  # of MediaPipe, which tables may number
+_NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 
 
@@ -37,6 +49,7 @@ class RawKeypoints:
     neck: str | None = None
     n_people: np.ndarray | None = None
     first_frame: int | None = None
+    notes: tuple[str, ...] = ()
 
 
 def read_npz_keypoints(path: Path) -> RawKeypoints:
@@ -65,11 +78,11 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
             if line.strip() and not line.startswith("#")]  # fmt: skip
     if not rows:
         raise FileFormatError(f"{path}: expected a header frame,NAME_x,NAME_y,...; it is empty")
-    header = rows[0][1]
-    if header[0].lower() != "frame":
+    header = [cell.lower() for cell in rows[0][1]]
+    if not any(name in header for name in FRAME_COLUMNS):
         raise FileFormatError(
             f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
-            f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
+            f"or frame,name,x,y[,confidence], got {','.join(rows[0][1])[:60]!r}"
         )
     for number, cells in rows:
         if len(cells) != len(header):
@@ -77,19 +90,58 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
                 f"{path}, line {number}: expected {len(header)} cells as in the header, "
                 f"got {len(cells)}"
             )
-    long = [cell.lower() for cell in header[1:4]] == ["name", "x", "y"]
+    rows, left_out = _without_other_columns(rows)
+    header = rows[0][1]
+    long = len(header) > 1 and header[1].lower() in _NAMES
     raw = _long_rows(path, header, rows[1:]) if long else _wide_rows(path, header, rows[1:])
+    if any(column.lower().endswith("z") for column in left_out):
+        _check_flat(path, raw.keypoints)
+    if left_out:
+        shown = _some(left_out)
+        raw.notes = (f"columns {shown} are passed over: x, y and a score of keypoints count",)
     raw.fps, raw.image_size = _csv_notes(path, notes)
     return raw
 
 
-def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
+_Rows = list[tuple[int, list[str]]]
+
+
+def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str]]:
+    """Return rows with the frame in front and without depths and times, and the names of these columns."""
+    header = rows[0][1]
+    lower = [cell.lower() for cell in header]
+    frame = next(lower.index(name) for name in FRAME_COLUMNS if name in lower)
+    known = set(lower)
+
+    def is_left_out(cell: str) -> bool:
+        if cell in _TIMES or (cell in _PASSED_OVER and {"x", "y"} <= known):
+            return True
+        name, _, kind = cell.rpartition("_")
+        return kind in _PASSED_OVER and {f"{name}_x", f"{name}_y"} <= known
+
+    left_out = [i for i, cell in enumerate(lower) if is_left_out(cell)]
+    kept = [frame, *(i for i in range(len(header)) if i != frame and i not in left_out)]
+    return [(number, [cells[i] for i in kept]) for number, cells in rows], [
+        header[i] for i in left_out
+    ]
+
+
+def _check_flat(path: Path, points: np.ndarray) -> None:
+    """Refuse x and y beside z that are places in a room, as their signs tell, and no pixels."""
+    known = points[np.isfinite(points).all(-1)]
+    negative = (known < 0).mean(0).max() if len(known) else 0.0
+    if negative > _NEGATIVE:
+        raise FileFormatError(
+            f"{path}: expected x and y of keypoints in pixels, and {100 * negative:.0f} % of x or y are "
+            "negative, beside a z: these are points in space; give the 2D keypoints of each camera"
+        )
+
+
+def _wide_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
     column = {name: i for i, name in enumerate(header)}
     names = [h[:-2] for h in header[1:] if h.endswith("_x")]
-    trust = _TRUST[0]
-    if not any(f"{n}_{trust}" in column for n in names):
-        trust = _TRUST[1]
-    wanted = {"frame"} | {f"{n}_{axis}" for n in names for axis in ("x", "y", trust)}
+    trust = next((t for t in _SCORES if any(f"{n}_{t}" in column for n in names)), _SCORES[0])
+    wanted = {header[0]} | {f"{n}_{axis}" for n in names for axis in ("x", "y", trust)}
     strange = [h for h in header if h not in wanted]
     absent = [f"{n}_y" for n in names if f"{n}_y" not in column]
     if names and strange:
@@ -124,9 +176,9 @@ def _some(columns: Sequence[str]) -> str:
     return ", ".join(columns[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
-    scored = len(header) == 5 and header[4].lower() in _TRUST
-    if len(header) != 4 + scored:
+def _long_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
+    scored = len(header) == 5 and header[4].lower() in _SCORES
+    if len(header) != 4 + scored or [cell.lower() for cell in header[2:4]] != ["x", "y"]:
         raise FileFormatError(
             f"{path}: expected columns frame,name,x,y[,confidence], got {','.join(header)}"
         )
@@ -134,7 +186,8 @@ def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     table = np.array([[_cell(path, number, c) for c in (cells[0], *cells[2:])]
                       for number, cells in rows]).reshape(-1, 3 + scored)  # fmt: skip
     index, count, first = _frames(path, table[:, 0], rows, repeated=True)
-    joint = np.array([names.index(cells[1]) for _, cells in rows], dtype=int)
+    place = {name: j for j, name in enumerate(names)}
+    joint = np.array([place[cells[1]] for _, cells in rows], dtype=int)
     if len(set(zip(index.tolist(), joint.tolist(), strict=True))) < len(rows):
         raise FileFormatError(
             f"{path}: a keypoint is given twice in one frame; expected one person"
@@ -145,7 +198,14 @@ def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]])
     if scored:
         confidence = np.zeros((count, len(names)))
         confidence[index, joint] = table[:, 3]
-    return RawKeypoints(points, tuple(names), confidence, first_frame=first)
+    return RawKeypoints(points, _of_numbers(names), confidence, first_frame=first)
+
+
+def _of_numbers(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names, those of MediaPipe's landmarks in place of their numbers."""
+    if len(names) == _LANDMARKS and set(names) == {str(i) for i in range(_LANDMARKS)}:
+        return tuple(LANDMARKS[int(name)] for name in names)
+    return tuple(names)
 
 
 def _cell(path: Path, number: int, cell: str) -> float:

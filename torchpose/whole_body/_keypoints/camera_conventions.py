@@ -173,8 +173,8 @@ def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[_Convention]:
             continue
         yield _Convention(
             f"keypoints are of images of {one}/{of} of the calibrated size",
-            f"give the calibration of these images: the first two rows of `matrix` and `size` times {one}/{of}"
-            ", or give keypoints of the calibrated images (.npz and .csv may state image_size)",
+            f"give the calibration of these images: the first two rows of `matrix` and `size` times "
+            f"{one}/{of}, or give keypoints of the calibrated images (.npz and .csv may state image_size)",
             rig.rotation, rig.translation, lambda pixels, s=s: (pixels + 0.5) / s - 0.5,
         )  # fmt: skip
 

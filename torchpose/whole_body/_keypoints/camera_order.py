@@ -34,8 +34,8 @@ def notes_on_order(names: Sequence[str], maps: RigMaps, frames: KeypointFrame) -
     several = ", hardly less in others," if first < second + MORE / 2 else ""
     return (
         f"inputs seem to be in another order than the cameras: cameras agree on {100 * first:.0f} % of the "
-        f"keypoints if {fits}{several} and on {100 * float(agreed[0]):.0f} % as they are given; give them in the "
-        "order of the cameras",
+        f"keypoints if {fits}{several} and on {100 * float(agreed[0]):.0f} % as they are given; give them "
+        "in the order of the cameras",
     )
 
 

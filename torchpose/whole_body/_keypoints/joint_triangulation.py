@@ -55,8 +55,9 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
 def agreement(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, ""]:
     """Return how well cameras agree on joints, from 0 to 1.
 
-    It is the mean of 1 - e^2 / 36 over all keypoints of joints that two cameras see or more. e is the distance
-    from the joint of all that agree, in standard deviations of the noise. Of those that do not agree 0 counts.
+    It is the mean of 1 - e^2 / 36 over all keypoints of joints that two cameras see or more. e is the
+    distance from the joint of all that agree, in standard deviations of the noise. Of those that do not
+    agree 0 counts.
 
     Args:
         maps: the cameras. frame: the keypoints.
