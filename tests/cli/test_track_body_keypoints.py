@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -15,6 +16,8 @@ from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli._body_keypoint_inputs import read_body_keypoints
 from torchpose.cli._track_body import command
+from torchpose.cli._track_body_options import check_numbers
+from torchpose.errors import InputError
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.skeleton._joint_sets import SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
@@ -103,12 +106,13 @@ def scene(tmp_path_factory):
 def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
     folder, _, points = scene
     cameras = list(load_cameras(folder / "cameras.toml").values())[:2]
-    for name in ("whole", "cut", "elsewhere"):
-        write_openpose(tmp_path / name, points[:, 0].numpy())
+    for i, name in enumerate(("whole", "cut", "elsewhere", "beside")):
+        write_openpose(tmp_path / name, points[:, 0].numpy() + i)
     for path in sorted((tmp_path / "cut").iterdir())[:3]:
         path.unlink()
-    for t, path in enumerate(sorted((tmp_path / "elsewhere").iterdir())):
-        path.rename(path.with_name(f"video_{5000 + t:012d}_keypoints.json"))
+    for name in ("elsewhere", "beside"):
+        for t, path in enumerate(sorted((tmp_path / name).iterdir())):
+            path.rename(path.with_name(f"video_{5000 + t:012d}_keypoints.json"))
 
     def read(*names):
         return read_body_keypoints([str(tmp_path / name) for name in names], cameras)
@@ -116,12 +120,12 @@ def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
     found = read("whole", "cut")
     assert len(found.points) == N
     assert found.points[:3, 1].isnan().all() and not found.confidence[:3, 1].any()
-    torch.testing.assert_close(found.points[3:, 1], found.points[3:, 0], equal_nan=True)
+    torch.testing.assert_close(found.points[3:, 1], found.points[3:, 0] + 1, equal_nan=True)
     assert any("numbers 0, 3; frames of one number are taken as simult" in n for n in found.notes)
     found = read("whole", "elsewhere")
-    torch.testing.assert_close(found.points[:, 1], found.points[:, 0], equal_nan=True)
+    torch.testing.assert_close(found.points[:, 1], found.points[:, 0] + 2, equal_nan=True)
     assert any("numbers 0, 5000; they are taken as simultaneous" in note for note in found.notes)
-    assert any("frame 0 is number 5000" in note for note in read("elsewhere", "elsewhere").notes)
+    assert any("frame 0 is number 5000" in note for note in read("elsewhere", "beside").notes)
 
 
 @pytest.fixture
@@ -393,6 +397,44 @@ def test_tables_that_are_no_cameras_are_said(torchpose, scene, tmp_path):
     assert "[charuco] is passed over: no camera" in done.out
     shown = torchpose("info", tmp_path / "config.toml")
     assert "[charuco] is passed over" in shown.out
+
+
+def test_one_input_of_two_cameras_is_refused(track, scene, tmp_path):
+    done = track(tmp_path / "a", "front_json", "front_json", "behind.npz", *PLAIN)
+    assert done.code == 2 and "hold the same keypoints" in done.err
+    shutil.copytree(scene[0] / "front_json", tmp_path / "copy")
+    done = track(tmp_path / "b", "front_json", tmp_path / "copy", "behind.npz", *PLAIN)
+    assert done.code == 2 and "hold the same keypoints" in done.err
+
+
+@pytest.mark.parametrize(
+    ("inputs", "cameras", "camera"),
+    [
+        (["c1.mp4", "c10.mp4", "c2.mp4"], ["cam1", "cam2", "cam10"], "'cam2'"),
+        (["2_json", "1_json"], ["cam_01", "cam_02"], "'cam_01'"),
+        (["c1.mp4", "c2.mp4", "c10.mp4"], ["cam1", "cam2", "cam10"], None),
+        (["c2.mp4", "c1.mp4"], ["cam_0", "cam_1"], None),
+        (["a.mp4", "b.mp4"], ["cam_3", "cam_4"], None),
+        (["left1.csv", "right1.csv"], ["cam_0", "cam_1"], None),
+    ],
+)
+def test_inputs_in_the_order_of_a_shell_are_refused(inputs, cameras, camera):
+    if camera is None:
+        check_numbers(inputs, cameras)
+        return
+    with pytest.raises(InputError, match=f"is given for camera {camera}; .*--camera-names"):
+        check_numbers(inputs, cameras)
+
+
+def test_cameras_that_do_not_agree_end_with_one(track, scene, tmp_path):
+    """Keypoints of another room, in two cameras: the poses are those of one camera alone."""
+    other = scene[2][:, 1].flip(0) * torch.tensor([0.3, 1.0]) + torch.tensor([40.0, 90.0])
+    write_keypoints(tmp_path / "other.npz", keypoints_of(other))
+    words = ("--camera-names", "front,left", *PLAIN)
+    done = track(tmp_path / "out", "front_json", tmp_path / "other.npz", *words)
+    assert done.code == 1 and "no two cameras agree" in done.err
+    done = track(tmp_path / "right", "front_json", "left.csv", *words)
+    assert done.code == 0 and "no two cameras agree" not in done.err
 
 
 def test_delays_bring_cameras_in_step(track, scene, tmp_path):

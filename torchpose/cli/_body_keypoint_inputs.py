@@ -137,15 +137,18 @@ def read_body_keypoints(
         everybody: take all people of every frame, and not one who is followed.
 
     Raises:
-        InputError, FileFormatError, SkeletonError: inputs that cannot be read, different frame rates.
+        InputError, FileFormatError, SkeletonError: inputs that cannot be read, different frame rates, an
+            input of two cameras.
         CameraError: images of another shape than the camera's.
     """
     from torchpose.camera._choice import fit_to_size
 
+    _refuse_twice([Path(path).resolve() for path in inputs], inputs)
     parts = [
         _read(path, detector, fps, everybody, camera.image_size)
         for path, camera in zip(inputs, cameras, strict=True)
     ]
+    _refuse_twice([_contents(part) for part in parts], inputs)
     fitted = [
         fit_to_size(camera, part.size, path)
         for camera, part, path in zip(cameras, parts, inputs, strict=True)
@@ -162,6 +165,21 @@ def read_body_keypoints(
     if not everybody:
         points, confidence = points[:, :, 0], confidence[:, :, 0]
     return BodyKeypoints(points, confidence, [camera for camera, _ in fitted], rate, notes)
+
+
+def _refuse_twice(values: Sequence[object], inputs: Sequence[str]) -> None:
+    """Raise `InputError` where two inputs are the same one, as their values tell."""
+    for i, value in enumerate(values):
+        if value in values[:i]:
+            raise InputError(
+                f"{inputs[values.index(value)]} and {inputs[i]} hold the same keypoints, which two cameras "
+                "cannot see; give each camera its own"
+            )
+
+
+def _contents(part: CameraKeypoints) -> bytes:
+    """Return the keypoints of a camera, to be compared."""
+    return part.points.numpy().tobytes()
 
 
 def _crowd_notes(

@@ -14,6 +14,7 @@ from torchpose.cli._common import pictures_possible, share_cores
 from torchpose.cli._options import options_of
 from torchpose.cli._track_body_options import (
     by_particles,
+    check_numbers,
     check_values,
     filter_options,
     parse_names,
@@ -180,6 +181,8 @@ def run(
     refuse_unsuited(given, by_keypoints)
     share_cores()
     found, notes = _cameras(cameras, camera_names, len(inputs))
+    if camera_names is None:
+        check_numbers(inputs, [camera.name for camera in found])
     job = BodyJob(
         out, given.files(), tuple(dict.fromkeys(formats or ())), up, overlay,
         pictures_possible(pictures), notes,

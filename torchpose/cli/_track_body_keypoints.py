@@ -46,6 +46,11 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_tracker import BodyTracker
 
 _CAMERAS = "refined_cameras.toml"
+_AGREES = 0.5  # share of the keypoints of a camera in a frame, above which it agrees with the body
+_DISAGREE = (
+    "no two cameras agree on where the person is in more than half of the frames, so the poses are not to be "
+    "trusted; the notes say what to check"
+)
 _FPS = 30.0  # frames per second with which options are checked before inputs are read
 
 
@@ -132,7 +137,11 @@ def track_keypoints(
             drawn += _write_skeletons(stage, people, cameras[0])
         facts = _facts(keypoints, settings, people, seconds)
         written += results.commit([*drawn, *write_page(cameras[0], people, facts, stage)])
-    return summary(people, facts, written, [*job.notes, *short, *results.notes])
+    code = summary(people, facts, written, [*job.notes, *short, *results.notes])
+    if settings.persons is None and settings.method == KALMAN and _disagree(keypoints, people[0]):
+        print(f"torchpose: {_DISAGREE}", file=sys.stderr)
+        return 1
+    return code
 
 
 def _nobody(keypoints: BodyKeypoints) -> str:
@@ -293,6 +302,18 @@ def _agreement(keypoints: BodyKeypoints, poses: "BodyTrack") -> str:
         share = percent(float(inlier.mean())) if len(inlier) else "no keypoints"
         shares.append(f"{camera.name} {share}")
     return ", ".join(shares)
+
+
+def _disagree(keypoints: BodyKeypoints, poses: "BodyTrack") -> bool:
+    """Return whether in most frames no two of the cameras with keypoints agree with the body."""
+    import torch
+
+    there = keypoints.confidence[poses.first_frame :][: len(poses), :, : len(poses.names)] > 0
+    inlier = poses.details["inlier"]
+    mean = torch.where(there, inlier, 0.0).sum(-1) / there.sum(-1).clamp_min(1)
+    several = there.any(-1).sum(-1) >= 2
+    apart = several & ((mean > _AGREES).sum(-1) < 2)
+    return 2 * int(apart.sum()) > len(poses)
 
 
 def _write_skeletons(

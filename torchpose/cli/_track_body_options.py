@@ -1,6 +1,9 @@
 """The options of `torchpose track-body`: how they are read, and which do not go together."""
 
+import re
 from argparse import ArgumentError
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from torchpose._core.checks import check_choice, check_height, check_positive
@@ -57,6 +60,28 @@ def parse_names(value: Any) -> list[str]:
     """Return names from a list, or from text with commas and perhaps brackets."""
     words = value if isinstance(value, list) else str(value).strip("[] ").split(",")
     return [str(word).strip().strip("'\"") for word in words]
+
+
+def check_numbers(inputs: Sequence[str], cameras: Sequence[str]) -> None:
+    """Raise `InputError` where inputs and cameras have the same numbers in their names, in another order.
+
+    A shell sorts cam10 before cam2, and camera files do not.
+
+    Args:
+        inputs: paths. cameras: their names, in the order in which they are taken.
+    """
+    of_inputs, of_cameras = (
+        [int(found[-1]) for name in names if (found := re.findall(r"\d+", name))]
+        for names in ([Path(path).stem for path in inputs], cameras)
+    )
+    distinct = len(set(of_inputs)) == len(inputs)
+    if distinct and of_inputs != of_cameras and sorted(of_inputs) == sorted(of_cameras):
+        i = next(i for i, number in enumerate(of_inputs) if number != of_cameras[i])
+        raise InputError(
+            f"inputs must be in the order of the camera file, and {inputs[i]} is given for camera "
+            f"{cameras[i]!r}; give them in the order {', '.join(cameras)}, or say by --camera-names whose "
+            "each is (a shell sorts 10 before 2)"
+        )
 
 
 def by_particles(method: str | None) -> bool:

@@ -37,7 +37,8 @@ def check_units(filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
         raise CameraError(
             "cameras must be given in metres, and as they are given the bones of the person are about "
             f"{factor:.2g} times as long as anybody's; divide translations in millimetres by 1000, those in "
-            "centimetres by 100, and those in an unknown unit by about that factor"
+            "centimetres by 100, and those in an unknown unit by about that factor. If they are in metres, "
+            "look whether poses are those from camera to world; those from world to camera are needed"
         )
 
 
