@@ -407,6 +407,16 @@ def test_one_input_of_two_cameras_is_refused(track, scene, tmp_path):
     assert done.code == 2 and "hold the same keypoints" in done.err
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".json", ".h5"])
+def test_data_of_another_kind_are_no_videos(track, tmp_path, suffix):
+    path = tmp_path / f"keypoints{suffix}"
+    path.write_bytes(b"[]")
+    done = track(tmp_path / "out", "front_json", path, path)
+    assert (
+        done.code == 2 and f"folder of OpenPose JSON files, one per frame, got {suffix}" in done.err
+    )
+
+
 @pytest.mark.parametrize(
     ("inputs", "cameras", "camera"),
     [

@@ -344,6 +344,23 @@ def test_numbers_of_landmarks_are_mediapipes(tmp_path):
     assert read.keypoints[0, 12].tolist() == pytest.approx([420.0, 250.0])
 
 
+def test_tables_of_deeplabcut(tmp_path):
+    header = ["scorer,net,net,net", "bodyparts,head,head,head", "coords,x,y,likelihood"]
+    read = read_keypoints(text(tmp_path, *header, "0,1.5,2.5,0.5", "2,3.5,4.5,0.25"))
+    assert read.names == ("head",) and len(read) == 3
+    assert read.keypoints[2].tolist() == [[3.5, 4.5]]
+    assert read.confidence is not None and read.confidence[:, 0].tolist() == [0.5, 0.0, 0.25]
+    one = ["individuals,ann,ann,ann", "individuals,ann,ann,bob"]
+    assert len(read_keypoints(text(tmp_path, header[0], one[0], *header[1:], "0,1,2,1"))) == 1
+    with pytest.raises(FileFormatError, match="of several"):
+        read_keypoints(text(tmp_path, header[0], one[1], *header[1:], "0,1,2,1"))
+
+
+def test_a_table_of_several_cameras_is_refused(tmp_path):
+    with pytest.raises(FileFormatError, match="expected a table of one camera"):
+        read_keypoints(text(tmp_path, "sync_index,port,point_id,img_loc_x,img_loc_y", "0,1,4,5,6"))
+
+
 def test_points_in_space_are_no_keypoints(tmp_path):
     rows = [f"{i},{300 * (-1) ** i},900,1200" for i in range(9)]
     with pytest.raises(FileFormatError, match="points in space"):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpose._core.terminal import show_progress
 from torchpose.cli._track import is_video
-from torchpose.errors import InputError, SkeletonError
+from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.skeleton._mediapipe_landmarks import count_given
 
 if TYPE_CHECKING:
@@ -19,6 +19,20 @@ if TYPE_CHECKING:
     from torchpose.video._source_interface import VideoSource
 
 _FPS = 30.0
+_DATA = (
+    ".npy",
+    ".json",
+    ".h5",
+    ".hdf5",
+    ".pkl",
+    ".pickle",
+    ".mat",
+    ".txt",
+    ".trc",
+    ".c3d",
+    ".parquet",
+)
+_DIFFERENT = 0.1  # share of frames by which inputs of one rate hardly differ
 _SAME_RATE = 3  # digits
 
 
@@ -97,10 +111,16 @@ def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
     """Return whether a body is tracked by keypoints: those of files, or of a detector.
 
     Raises:
+        FileFormatError: a file of data that is no keypoints.
         InputError: an input that is not there, an empty folder, keypoints beside videos without a detector,
             or a detector without videos.
     """
     for path in map(Path, inputs):
+        if path.suffix.lower() in _DATA and path.exists():
+            raise FileFormatError(
+                f"{path}: expected keypoints of one camera as .npz, .csv or a folder of OpenPose JSON files, "
+                f"one per frame, got {path.suffix}"
+            )
         if path.is_dir() and not any(path.iterdir()):
             raise InputError(
                 f"{path}: expected OpenPose JSON files or images, but the folder is empty"
@@ -259,6 +279,8 @@ def _in_step(
     )
     shown = ", ".join(map(str, lengths))
     note = f"the inputs have {shown} frames; the first {n} of each are used"
+    if n < (1 - _DIFFERENT) * max(lengths):
+        note += "; if they show the same time, their frame rates differ: bring them to one rate"
     return points, confidence, (note,) * (len(set(lengths)) > 1)
 
 

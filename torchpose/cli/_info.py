@@ -282,7 +282,8 @@ def _starts_as_keypoints(path: Path) -> bool:
     with reading(path, "a table"), path.open(encoding="utf-8-sig", errors="replace") as stream:
         lines = stream.read(_SNIFFED).splitlines()
     first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    return any(cell.strip().lower() in FRAME_COLUMNS for cell in first.split(","))
+    begins = (*FRAME_COLUMNS, "scorer")  # the second is DeepLabCut's
+    return any(cell.strip().lower() in begins for cell in first.split(","))
 
 
 def _length(n_frames: int, fps: float | None) -> str:

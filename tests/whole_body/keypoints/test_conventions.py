@@ -12,7 +12,7 @@ from torchpose.errors import CameraError
 from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
-from torchpose.whole_body._keypoints.keypoint_notes import notes_on_a_rolled_camera
+from torchpose.whole_body._keypoints.keypoint_notes import notes_on_a_rolled_camera, notes_on_up
 
 WIDTH, HEIGHT = 1920, 1080
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
@@ -51,8 +51,9 @@ def seen():
     return scene(3, n_frames=20)
 
 
-def track(rig, keypoints, **options):
-    return BodyTracker(rig, "kalman", fps=FPS)(keypoints=keypoints, names=NAMES, **options)
+def track(rig, keypoints, up=None, **options):
+    tracker = BodyTracker(rig, "kalman", fps=FPS, up=up)
+    return tracker(keypoints=keypoints, names=NAMES, **options)
 
 
 @pytest.mark.parametrize(
@@ -111,6 +112,12 @@ def test_an_order_that_is_wrong_is_said_where_several_fit():
     assert "another order" in note
     right = single.frames(keypoints, None, NAMES, None)
     assert notes_on_order(rig.names, single.tracker.filter.maps, right) == ()
+
+
+def test_an_axis_that_does_not_point_up_is_said(seen):
+    assert notes_on_up("y", seen.joints) == notes_on_up(None, seen.joints) == ()
+    lying = track(seen.rig, seen.keypoints, up="z")
+    assert any("degrees away from z, which was given as up" in note for note in lying.notes)
 
 
 def test_a_person_upside_down_in_one_camera_is_said():

@@ -32,6 +32,8 @@ _PASSED_OVER = (
 )  # of keypoints, beside x and y; MediaPipe's depth is no measurement
 _TIMES = ("time", "timestamp", "timestamp_ms", "time_s", "frame_time")
 _LANDMARKS = 33  # of MediaPipe, which tables may number
+_DEEPLABCUT = {"scorer", "individuals", "bodyparts", "coords"}  # first cells of its header
+_OF_SEVERAL_CAMERAS = {"point_id", "img_loc_x", "img_loc_y"}
 _NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 
@@ -78,7 +80,13 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
             if line.strip() and not line.startswith("#")]  # fmt: skip
     if not rows:
         raise FileFormatError(f"{path}: expected a header frame,NAME_x,NAME_y,...; it is empty")
+    rows = _from_deeplabcut(path, rows)
     header = [cell.lower() for cell in rows[0][1]]
+    if set(header) >= _OF_SEVERAL_CAMERAS:
+        raise FileFormatError(
+            f"{path}: expected a table of one camera, got one of several, as Caliscope writes it; write a "
+            "table frame,landmark,x,y of each from sync_index, names of point_id, img_loc_x and img_loc_y"
+        )
     if not any(name in header for name in FRAME_COLUMNS):
         raise FileFormatError(
             f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
@@ -104,6 +112,18 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
 
 
 _Rows = list[tuple[int, list[str]]]
+
+
+def _from_deeplabcut(path: Path, rows: _Rows) -> _Rows:
+    """Return rows with one header in place of DeepLabCut's three lines scorer, bodyparts and coords."""
+    lines = {cells[0].lower(): cells for _, cells in rows[:4]}
+    if not {"scorer", "bodyparts", "coords"} <= set(lines):
+        return rows
+    if len(set(lines.get("individuals", [])[1:])) > 1:
+        raise FileFormatError(f"{path}: expected the keypoints of one person, got those of several")
+    pairs = zip(lines["bodyparts"][1:], lines["coords"][1:], strict=False)
+    header = ["frame", *(f"{part}_{kind}" for part, kind in pairs)]
+    return [(rows[0][0], header), *rows[len(lines.keys() & _DEEPLABCUT) :]]
 
 
 def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str]]:

@@ -59,6 +59,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_size,
     notes_on_still_cameras,
     notes_on_turned_cameras,
+    notes_on_up,
     notes_on_upside_down_cameras,
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
@@ -526,6 +527,7 @@ class KeypointBodyTracker(nn.Module):
         )  # fmt: skip
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
         notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)
+        notes += notes_on_up(self.tracker.filter.up, poses.joints)
         turned = notes_on_turned_cameras(self.rig.names, angles_of(poses.turn), first_frame)
         notes += notes_on_left_out_cameras(self.rig.names, poses.off, first_frame) + turned
         if len(self.rig) == 1 and self.tracker.filter.up is None:

@@ -19,6 +19,7 @@ _LEAST_TURN = (
 )
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
 _DOWN = 0.5  # of a unit vector, along the columns of an image
+_LYING = 60.0  # degrees of the trunk from the axis that points up, from which on it is said
 _LEANS = 8.0  # degrees by which trunk and legs lean in most images of a camera that may be rolled
 
 
@@ -261,6 +262,25 @@ def notes_on_upside_down_cameras(
         "the axis that was given as up points down in all images: another axis points up, or the cameras' "
         "rotations are not those of a calibration (a camera without a rotation has y down); leave up (--up) "
         "out, or correct the rotations",
+    )
+
+
+def notes_on_up(up: str | None, joints: Float[Tensor, "T J 3"]) -> tuple[str, ...]:
+    """Return a note if trunks are far from the axis that is said to point up.
+
+    Args:
+        up: "y" or "z", None if it is not known. joints: of the person, metres, world axes.
+    """
+    if up is None:
+        return ()
+    trunk = joints[:, BODY_15.joint("neck")] - joints[:, BODY_15.joint("pelvis")]
+    cosine = trunk[:, "xyz".index(up)] / trunk.norm(dim=-1).clamp_min(1e-9)
+    angle = float(torch.rad2deg(cosine.clamp(-1, 1).acos()).median())
+    if angle < _LYING:
+        return ()
+    return (
+        f"the trunk is {angle:.0f} degrees away from {up}, which was given as up, in half of the frames or "
+        "more; if the person does not lie, another axis points up, and files of --formats are turned as well",
     )
 
 
