@@ -127,3 +127,15 @@ def test_a_person_upside_down_in_one_camera_is_said():
     pixels = torch.stack([pixels[..., 0], HEIGHT - 1 - pixels[..., 1]], -1)
     (note,) = notes_on_a_rolled_camera("a", pixels, there)
     assert "upside down" in note
+
+
+@pytest.mark.parametrize("cameras", [2, 3])
+def test_a_live_stream_is_refused_at_its_beginning(seen, cameras):
+    rig = rig_of_poses(seen.rig.select(range(cameras)), POSES["from camera to world"])
+    tracker = BodyTracker(rig, "kalman", fps=FPS)
+    with pytest.raises(CameraError, match="from camera to world"):
+        tracker.step(tracker.init(names=NAMES), keypoints=seen.keypoints[0, :cameras])
+    tracker = BodyTracker(seen.rig, "kalman", fps=FPS)
+    state, _ = tracker.step(tracker.init(names=NAMES), keypoints=seen.keypoints[0])
+    upside_down = torch.stack(PIXELS["upside down"](*seen.keypoints[1].unbind(-1)), -1)
+    tracker.step(state, keypoints=upside_down)  # one frame of a stream that has begun stops nothing

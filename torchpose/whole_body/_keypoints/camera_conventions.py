@@ -24,13 +24,13 @@ from torchpose.whole_body._keypoints.joint_triangulation import agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
 _FRAMES = 12  # that are looked at, at most
-_LEAST_KEYPOINTS = 40  # in these frames, of joints that two cameras see
+_LEAST_KEYPOINTS = 24  # in these frames, of joints that two cameras see
 _LEAST_BONES = 20  # in all images, that tell a size
 _SURE = 0.92  # agreement from which on nothing else is tried, unless the person is upside down
 _WELL_OF_TWO = (
     0.9  # agreement of two cameras, which is easier, that another convention has to reach
 )
-_UPSIDE_DOWN = 0.8  # share of images in which the neck is below the pelvis
+_MOST_TRUNKS = 0.8  # share of images that show the trunk the same way
 _LITTLE = 0.02  # by how much cameras have to agree better on one who is not upside down
 _SIZES = (0.4, 1.6)  # of a person, by what is expected
 _MOST = 0.99  # share of the keypoints that is in the images
@@ -46,7 +46,7 @@ class _Convention(NamedTuple):
         said: in which cameras agree, after "if". advice: what to do.
         rotation, translation: of the cameras [C, 3, 3], [C, 3].
         pixels: the change of keypoints [..., C, J, 2].
-        upright: whether one who was upside down in images is upright in them.
+        tilts: whether what is up in images is not up in these.
     """
 
     said: str
@@ -54,7 +54,7 @@ class _Convention(NamedTuple):
     rotation: Tensor
     translation: Tensor
     pixels: _Pixels | None = None
-    upright: bool = False
+    tilts: bool = False
 
 
 def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
@@ -75,18 +75,20 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
         return
     given = float(agreement(filter.maps, some))
     human = _is_human(filter, filter.maps, some)
-    upside_down = _is_upside_down(some)
+    above, upside_down = _trunks(some)
     if human and given > _SURE and not upside_down:
         return
     found = []
     least = _WELL_OF_TWO if len(rig) == 2 else WELL
     for convention in (*_conventions(rig), *_of_sizes(rig, some)):
+        if above and convention.tilts:
+            continue
         maps = _maps(rig, filter.maps, convention.rotation, convention.translation)
         moved = some
         if convention.pixels is not None:
             moved = some._replace(pixels=convention.pixels(some.pixels))
         fits = float(agreement(maps, moved))
-        more = _LITTLE if upside_down and convention.upright else MORE
+        more = _LITTLE if upside_down and convention.tilts else MORE
         if fits > max(least, given + more if human else 0.0) and _is_human(filter, maps, moved):
             found.append((fits, convention))
     if not found:
@@ -106,12 +108,15 @@ def _is_human(filter: BodyKalmanFilter, maps: RigMaps, some: KeypointFrame) -> b
     return len(logs) < _LEAST_BONES or _SIZES[0] < math.exp(float(logs.median())) < _SIZES[1]
 
 
-def _is_upside_down(some: KeypointFrame) -> bool:
-    """Return whether the neck is below the pelvis in most images."""
+def _trunks(some: KeypointFrame) -> tuple[bool, bool]:
+    """Return whether the neck is above the pelvis in most images, more than beside it, and whether below."""
     ends = [BODY_15.joint("neck"), BODY_15.joint("pelvis")]
     both = (some.inlier[..., ends] > 0).all(-1)
-    neck, pelvis = some.pixels[..., ends, 1][both].unbind(-1)
-    return len(neck) > 0 and float((neck > pelvis).double().mean()) > _UPSIDE_DOWN
+    across, down = (some.pixels[..., ends[1], :] - some.pixels[..., ends[0], :])[both].unbind(-1)
+    if len(down) == 0:
+        return False, False
+    above, below = ((side > across.abs()).double().mean() for side in (down, -down))
+    return bool(above > _MOST_TRUNKS), bool(below > _MOST_TRUNKS)
 
 
 def _maps(rig: CameraRig, maps: RigMaps, rotation: Tensor, translation: Tensor) -> RigMaps:
@@ -128,7 +133,7 @@ def _conventions(rig: CameraRig) -> Iterator[_Convention]:
     yield from _of_poses(R, t)
     yield _Convention(
         "keypoints are v, u, a row and a column", "give u, v: u to the right and v down", R, t,
-        lambda pixels: pixels.flip(-1),
+        lambda pixels: pixels.flip(-1), True,
     )  # fmt: skip
     if None in rig.sizes:
         return
@@ -154,7 +159,7 @@ def _conventions(rig: CameraRig) -> Iterator[_Convention]:
         yield _Convention(
             f"the images are {turn} against the calibrated ones",
             "turn the images, or their keypoints, back, or calibrate the turned images",
-            R, t, pixels, turn == "upside down",
+            R, t, pixels, True,
         )  # fmt: skip
 
 

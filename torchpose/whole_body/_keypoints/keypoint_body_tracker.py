@@ -225,6 +225,8 @@ class KeypointBodyTracker(nn.Module):
         frame = frame.map(lambda value: value[None])
         before, standing = (None, None) if stream is None else stream
         body, pose, _ = self.tracker.advance(before, frame)
+        if bool(body.begun) and not (before is not None and bool(before.begun)):
+            self.check_cameras(frame.map(lambda value: value[:, None]))
         found = None
         if feet is not None:
             feet = feet.map(lambda value: value[None])
