@@ -180,8 +180,13 @@ def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[_Convention]:
             f"keypoints are of images of {one}/{of} of the calibrated size",
             f"give the calibration of these images: the first two rows of `matrix` and `size` times "
             f"{one}/{of}, or give keypoints of the calibrated images (.npz and .csv may state image_size)",
-            rig.rotation, rig.translation, lambda pixels, s=s: (pixels + 0.5) / s - 0.5,
+            rig.rotation, rig.translation, _divided(s),
         )  # fmt: skip
+
+
+def _divided(factor: float) -> _Pixels:
+    """Return the change of pixels of images that are larger by a factor to those of the calibrated ones."""
+    return lambda pixels: (pixels + 0.5) / factor - 0.5
 
 
 def _of_poses(R: Float[Tensor, "C 3 3"], t: Float[Tensor, "C 3"]) -> Iterator[_Convention]:
