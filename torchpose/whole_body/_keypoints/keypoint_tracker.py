@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
+from torchpose.body._articulation import BodyPoint
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
@@ -17,7 +18,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_size import SizeBelief
-from torchpose.whole_body._keypoints.body_smoothing import smooth
+from torchpose.whole_body._keypoints.body_smoothing import CHUNK, smooth
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
     CameraFaults,
@@ -445,8 +446,7 @@ class KeypointTracker(nn.Module):
         result = smooth(self.filter, states, widened, filtered.started.mT)
         point = result.mean.map(lambda value: value.transpose(0, 1))
         cov = result.cov.transpose(0, 1)
-        joints, jacobian = self.filter.articulation.linearise(point)
-        joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
+        joints, joint_cov = self._joints(point, cov)
         poses = filtered._replace(
             joints=joints,
             covariance=self._unsure(joint_cov, joints, filtered.alone),
@@ -455,6 +455,17 @@ class KeypointTracker(nn.Module):
             joint_cov=joint_cov,
         )
         return poses if self.only is None else self.only.at_last_size(poses)
+
+    def _joints(self, point: BodyPoint, cov: Tensor) -> tuple[Tensor, Tensor]:
+        """Return joints [B, T, J, 3] and covariances; Jacobians of all frames would fill the memory."""
+        parts = []
+        for begin in range(0, cov.shape[1], CHUNK):
+            rows = slice(begin, begin + CHUNK)
+            some = point.map(lambda value: value[:, rows])  # noqa: B023
+            joints, jacobian = self.filter.articulation.linearise(some)
+            parts.append((joints, (jacobian @ cov[:, rows].unsqueeze(-3)) @ jacobian.mT))
+        joints, joint_cov = (torch.cat(values, 1) for values in zip(*parts, strict=True))
+        return joints, joint_cov
 
 
 def _sees_enough(there: Bool[Tensor, "B C J"]) -> Bool[Tensor, "B C"]:
