@@ -43,8 +43,8 @@ class PinholeCamera(nn.Module):
         skew: K[0, 1], pixels; nearly always 0.
         distortions: OpenCV's k1, k2, p1, p2, ...; kept and saved, not applied by `forward`.
         rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues
-            vector in radians or a matrix R [3, 3], and metres. The identity without them. Vectors may be
-            rows or columns, as OpenCV returns them.
+            vector in radians or a matrix R [3, 3], and metres. The identity without them. Lists, arrays or
+            tensors; vectors may be rows or columns, as OpenCV returns them.
         fisheye: the distortions are OpenCV's fisheye model.
         up: the direction that points up, against gravity, in the axes of the camera, of any length; None is
             unknown, and trackers take the camera to be about level, (0, -1, 0). `tilted` makes it of angles,
@@ -79,8 +79,8 @@ class PinholeCamera(nn.Module):
         *,
         skew: float = 0.0,
         distortions: Sequence[float] = (),
-        rotation: Sequence[float] | Sequence[Sequence[float]] = (0.0, 0.0, 0.0),
-        translation: Sequence[float] = (0.0, 0.0, 0.0),
+        rotation: Any = (0.0, 0.0, 0.0),
+        translation: Any = (0.0, 0.0, 0.0),
         fisheye: bool = False,
         up: Sequence[float] | None = None,
     ) -> None:
