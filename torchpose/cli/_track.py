@@ -185,7 +185,7 @@ def parse_stds(value: Any) -> float | list[float] | None:
     Raises:
         ArgumentError: anything else.
     """
-    parts = value.split(",") if isinstance(value, str) else value
+    parts = value.strip("[]").split(",") if isinstance(value, str) else value
     try:
         numbers = [float(p) for p in (parts if isinstance(parts, list) else [parts])]
     except (TypeError, ValueError) as error:
