@@ -131,14 +131,17 @@ def fit_lifter(
     return Lifter(train_lifter(net, loss, 2 if quick else _STEPS, kind))
 
 
-def train_lifter(net: nn.Module, loss: Callable[[], Tensor], steps: int, name: str) -> nn.Module:
+def train_lifter(
+    net: nn.Module, loss: Callable[[], Tensor], steps: int, name: str, rate: float = 2e-3
+) -> nn.Module:
     """Return a net after so many steps of AdamW, for evaluation.
 
     Args:
         net: to be trained. loss: of a new batch. steps: number of batches. name: on the bar.
+        rate: of learning, the largest.
     """
-    optimiser = torch.optim.AdamW(net.parameters(), lr=2e-3, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
     for _ in tqdm(range(steps), desc=name):
         optimiser.zero_grad()
         loss().backward()

@@ -10,12 +10,14 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR [--out FILE] [--methods NAME ...] [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --noise-alone --methods kalman kalman-smoothed pose2sim
     python -m benchmarks.keypoint_bodies --data DIR --heights [--lifters FILE]
+    python -m benchmarks.keypoint_bodies --data DIR --sitting [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
 The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
-is. The fourth prints what the constants of the filters of single joints were chosen by. The fifth fits the
-network that comes with torchpose and lifts the keypoints of one camera.
+is. The fourth shows people who sit to one camera. The fifth prints what the constants of the filters of
+single joints were chosen by. The sixth fits the network that comes with torchpose and lifts the keypoints of
+one camera.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ from benchmarks.keypoint_bodies.clips import (
 from benchmarks.keypoint_bodies.lifting import fit_shipped
 from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, Method, methods_of, takes
 from benchmarks.keypoint_bodies.real import add_real_table
+from benchmarks.keypoint_bodies.sitting import add_sitting_table
 from benchmarks.keypoint_bodies.tables import add_table
 from torchpose.evaluation import Report
 
@@ -65,6 +68,7 @@ def main(
     out: TableFile | None = None,
     noise_alone: bool = False,
     heights: bool = False,
+    sitting: bool = False,
     choose: bool = False,
     fit: Path | None = None,
     quick: bool = False,
@@ -79,6 +83,7 @@ def main(
         out: file for the same as Markdown, or a folder.
         noise_alone: whether keypoints have noise and nothing else, in several cameras only.
         heights: whether one camera is told how high it is, in place of the tables.
+        sitting: whether people sit, seen by one camera, in place of the tables.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
@@ -96,13 +101,16 @@ def main(
         clips = {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
     if choose:
         add_choices(report, clips)
-    elif heights:
+    elif heights or sitting:
         chosen = {
             name: one
             for name, one in methods_of(methods, data, lifters, quick).items()
             if takes(name, 1)
         }
-        _add_heights(report, chosen, clips, data, quick)
+        if sitting:
+            add_sitting_table(report, chosen, data, quick)
+        else:
+            _add_heights(report, chosen, clips, data, quick)
     else:
         chosen = methods_of(methods, data, lifters, quick)
         for cameras in (count for count in RIGS if count > 1 or not noise_alone):

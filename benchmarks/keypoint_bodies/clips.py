@@ -276,7 +276,7 @@ def draw_ring(
         reach = ((path - middle) @ ray).max()
         distance = torch.maximum(_between(_DISTANCE, away), reach + _NEAREST)
         place = foot + distance * ray + _between(_CAMERA_HEIGHT, high) * up
-        cameras.append(_aimed(place, foot + 0.95 * up, up, joints, f"cam_{i:02d}"))
+        cameras.append(aimed(place, foot + 0.95 * up, up, joints, f"cam_{i:02d}"))
     return CameraRig(cameras)
 
 
@@ -296,7 +296,7 @@ def mean_left(joints: Float[Tensor, "T 15 3"], up: Float[Tensor, "3"]) -> Float[
     return normalize(across - (across @ up) * up, dim=-1)
 
 
-def _aimed(
+def aimed(
     place: Tensor, target: Tensor, up: Tensor, joints: Float[Tensor, "T 15 3"], name: str
 ) -> PinholeCamera:
     """Return an upright camera that looks at a target and has all joints in its image."""

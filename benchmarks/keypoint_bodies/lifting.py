@@ -6,7 +6,7 @@ cameras that are drawn anew for each piece (`LiftingExamples`), with a detector'
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,9 +30,14 @@ from torchpose.whole_body._keypoints.lifting_network import LiftingNetwork, Lift
 __all__ = ["fit_shipped"]
 
 _STEPS, _QUICK_STEPS = 10_000, 2
+_SEAT_SHARE, _SEAT_STEPS, _SEAT_RATE = 0.25, 0.2, 1e-3
+# Of the pieces people sit in after the first fit; share of its steps that follow; rate of learning.
 _LONGEST = 600  # frames of a recording
 _UNIT = 0.3  # metres in which errors count
 _KINECT_SHARE = 0.5  # of the pieces
+
+Shares = Sequence[tuple[float, Sequence[MocapClip]]]
+"""Shares of the pieces, and the recordings, of sets."""
 
 
 def fit_shipped(data: Path, quick: bool = False) -> LiftingNetwork:
@@ -68,7 +73,34 @@ def _fitted(
         legs=_legs(mocap),
     )
     network = LiftingNetwork(info)
-    draw = LiftingExamples(((1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect)), seed)
+    shares = ((1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect))
+    train_lifter(network, _loss(network, LiftingExamples(shares, seed)), steps, "lifting network")
+    return with_seats(network, shares, max(1, int(_SEAT_STEPS * steps)), seed)
+
+
+def with_seats(
+    network: LiftingNetwork, shares: Shares, steps: int, seed: int = 0
+) -> LiftingNetwork:
+    """Return a network that was fitted on, to pieces of recordings in some of which people sit.
+
+    Its parameters are midway between those of the first fit and those of the second, as of Wortsman et al.,
+    "Robust fine-tuning of zero-shot models" (CVPR 2022): those of the second alone take people with short
+    legs who stand for people who sit.
+
+    Args:
+        network: of the first fit, changed in place. shares: as of `LiftingExamples`.
+        steps: of AdamW. seed: of pieces, the next one is taken.
+    """
+    first = {name: value.clone() for name, value in network.state_dict().items()}
+    draw = LiftingExamples(shares, seed + 1, _SEAT_SHARE)
+    train_lifter(network, _loss(network, draw), steps, "people who sit", _SEAT_RATE)
+    second = network.state_dict()
+    network.load_state_dict({name: (first[name] + second[name]) / 2 for name in first})
+    return network.requires_grad_(False)
+
+
+def _loss(network: LiftingNetwork, draw: LiftingExamples) -> Callable[[], Tensor]:
+    """Return what is to be small: the distance of joints, and how unlikely it is by the deviations."""
 
     def loss() -> Tensor:
         seen, joints = draw()
@@ -79,8 +111,7 @@ def _fitted(
         known = joints.isfinite().all(-1)
         return (off + 1e-6).sqrt()[known].mean() + spread[known].mean()
 
-    train_lifter(network, loss, steps, "lifting network")
-    return network.requires_grad_(False)
+    return loss
 
 
 def _legs(clips: Sequence[MocapClip]) -> float:

@@ -3,7 +3,8 @@
 Every piece of a recording gets bones of other lengths and a camera of its own: two fifths about in front of
 the person, the others anywhere around, 2.5 to 5.5 m away. Some move their arms as somebody else does, since
 recordings have few actions. In some legs or arms are not seen at all: people stand behind tables and at the
-border of the image. Every second piece is mirrored.
+border of the image. Every second piece is mirrored. Some sit (`seats`), in front of
+cameras that may be nearer and higher, and often behind a desk.
 """
 
 from __future__ import annotations
@@ -13,19 +14,20 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks._lifters import draw_pieces
 from benchmarks.keypoint_bodies.clips import OTHER, detect, mean_left
+from benchmarks.keypoint_bodies.seats import seated
 from torchpose.body import BODY_15
 from torchpose.io._mocap import MocapClip
 from torchpose.math import euler_to_matrix
 from torchpose.whole_body._keypoints.keypoint_body_tracker import INLIER
 from torchpose.whole_body._keypoints.lifting_network import lifting_features
 
-__all__ = ["LiftingExamples"]
+__all__ = ["LiftingExamples", "with_arms"]
 
 _SEQUENCES, _FRAMES = 32, 48
 _NEAREST, _DEPTHS = 2.5, 3.0  # metres to the middle of a path, and their range
@@ -38,7 +40,13 @@ _FOCAL = 1300.0  # pixels
 _LENGTH_STD, _MOST = 0.08, 0.4  # of the logarithms of lengths, and their largest change
 _WIDER = {"hip": 2.0, "shoulder": 1.2}  # by which widths vary more than limbs
 _HIDDEN = (("knee", "ankle"), ("hip", "knee", "ankle"), ("elbow", "wrist"), ("wrist",))
-_SHARE_HIDDEN = 0.25
+_LEGS = 2  # kinds of hidden joints, the first ones
+_SHARE_HIDDEN, _SHARE_AT_DESK = 0.25, 0.4  # of the pieces, and of those in which people sit
+_NEARER, _HIGHER, _CLEAR_OF_SEAT = (
+    1.0,
+    0.3,
+    1.3,
+)  # metres by which cameras may be, of people who sit
 _ARMS_OF_OTHERS = 0.3  # share of the pieces
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
 _ARMS = [
@@ -70,26 +78,38 @@ class LiftingExamples:
 
     Args:
         sets: their share of the pieces, and the recordings, of each. seed: of all that is drawn.
+        seats: share of the pieces in which people sit.
     """
 
-    def __init__(self, sets: Sequence[tuple[float, Sequence[MocapClip]]], seed: int = 0) -> None:
+    def __init__(
+        self,
+        sets: Sequence[tuple[float, Sequence[MocapClip]]],
+        seed: int = 0,
+        seats: float = 0.0,
+    ) -> None:
         self.pool = [_recording(clip) for _, clips in sets for clip in clips]
         shares = [share / sum(map(len, clips)) for share, clips in sets for _ in clips]
         self.lengths = [len(one.joints) for one in self.pool]
         self.weights = torch.tensor(shares) * torch.tensor(self.lengths)
         self.generator = torch.Generator().manual_seed(seed)
+        self.seats = seats
 
     def __call__(self) -> tuple[Float[Tensor, "N T F"], Float[Tensor, "N T 15 3"]]:
         """Return features, and joints from the pelvis in the axes of the camera, metres."""
         pieces = self._drawn()
         bodies = self._with_arms_of_others(pieces.joints)
+        sits = torch.zeros(_SEQUENCES, 1, dtype=torch.bool)
+        if self.seats:  # nothing is drawn otherwise
+            sits = self._uniform(_SEQUENCES, 1) < self.seats
+            in_seats = seated(bodies, pieces.up, self.generator)
+            bodies = torch.where(sits[..., None, None], in_seats, bodies)
         pieces = pieces._replace(joints=_resized(bodies, self._factors()))
-        joints = self._mirrored(self._as_seen(pieces))
+        joints = self._mirrored(self._as_seen(pieces, sits))
         pixels = _FOCAL * joints[..., :2] / joints[..., 2:].clamp_min(0.1)
         found = detect(pixels.transpose(0, 1), self.generator)  # a camera for each piece
         rays = (found.keypoints.transpose(0, 1) / _FOCAL).float()
         sure = found.confidence.transpose(0, 1).float()
-        sure = torch.where(sure > 0, sure.clamp(*INLIER), 0.0) * self._shown()[:, None]
+        sure = torch.where(sure > 0, sure.clamp(*INLIER), 0.0) * self._shown(sits)[:, None]
         given = zip(rays.nan_to_num(), sure, pieces.fps, strict=True)
         seen = torch.stack([lifting_features(*one) for one in given])
         return seen, joints - joints[:, :, [_PELVIS]]
@@ -108,7 +128,7 @@ class LiftingExamples:
         """Return bodies, some of which have the arms of another piece, in the axes of their trunks."""
         others = joints[torch.randperm(_SEQUENCES, generator=self.generator)]
         swapped = self._uniform(_SEQUENCES, 1, 1, 1) < _ARMS_OF_OTHERS
-        return torch.where(swapped, _with_arms(joints, others), joints)
+        return torch.where(swapped, with_arms(joints, others), joints)
 
     def _factors(self) -> Float[Tensor, "N 15"]:
         """Return factors on the lengths of bones, the same on both sides."""
@@ -117,7 +137,7 @@ class LiftingExamples:
         first = torch.minimum(torch.arange(len(wider)), torch.tensor(OTHER))
         return logs[:, first].clamp(-_MOST, _MOST).exp()
 
-    def _as_seen(self, pieces: _Pieces) -> Float[Tensor, "N T 15 3"]:
+    def _as_seen(self, pieces: _Pieces, sits: Bool[Tensor, "N 1"]) -> Float[Tensor, "N T 15 3"]:
         """Return the joints in the axes of cameras that look at the person."""
         joints, up, left, _ = pieces
         path = joints[:, :, _PELVIS]
@@ -130,8 +150,10 @@ class LiftingExamples:
         ray = azimuth.cos() * torch.linalg.cross(left, up) + azimuth.sin() * left
         away, high = self._uniform(2, _SEQUENCES, 1)
         reach = ((path - middle[:, None]) * ray[:, None]).sum(-1).amax(1)[:, None]
-        distance = torch.maximum(_NEAREST + _DEPTHS * away, reach + _CLEAR)
-        place = foot + distance * ray + (_LOW + _HEIGHTS * high) * up
+        nearest = _NEAREST - _NEARER * sits
+        clear = torch.where(sits, _CLEAR_OF_SEAT, _CLEAR)
+        distance = torch.maximum(nearest + _DEPTHS * away, reach + clear)
+        place = foot + distance * ray + (_LOW + (_HEIGHTS + _HIGHER * sits) * high) * up
         z = normalize(foot + _AIM * up - place, dim=-1)
         x = normalize(torch.linalg.cross(z, up), dim=-1)
         level = torch.stack([x, torch.linalg.cross(z, x), z], 1)
@@ -144,11 +166,16 @@ class LiftingExamples:
         mirror = torch.tensor([-1.0, 1.0, 1.0])
         return torch.where(flip, (joints * mirror)[..., OTHER, :], joints)
 
-    def _shown(self) -> Float[Tensor, "N 15"]:
+    def _shown(self, sits: Bool[Tensor, "N 1"]) -> Float[Tensor, "N 15"]:
         """Return 0 for joints that are not seen at all in a piece, and 1 for the others."""
         kinds = [[not name.endswith(kind) for name in BODY_15.names] for kind in _HIDDEN]
         kind = torch.randint(len(_HIDDEN), (_SEQUENCES,), generator=self.generator)
-        hides = self._uniform(_SEQUENCES, 1) < _SHARE_HIDDEN
+        share = self._uniform(_SEQUENCES, 1)
+        hides = share < _SHARE_HIDDEN
+        if self.seats:
+            at_desk = sits & (share >= _SHARE_HIDDEN) & (share < _SHARE_HIDDEN + _SHARE_AT_DESK)
+            kind = torch.where(at_desk[:, 0], kind % _LEGS, kind)
+            hides = hides | at_desk
         return torch.where(hides, torch.tensor(kinds)[kind].float(), 1.0)
 
     def _normal(self, *shape: int) -> Tensor:
@@ -163,7 +190,7 @@ def _recording(clip: MocapClip) -> _Recording:
     return _Recording(clip.joints.float(), clip.up.float(), left.float(), clip.fps)
 
 
-def _with_arms(
+def with_arms(
     joints: Float[Tensor, "N T 15 3"], others: Float[Tensor, "N T 15 3"]
 ) -> Float[Tensor, "N T 15 3"]:
     """Return bodies with the arms of others, turned with their trunks."""

@@ -28,9 +28,11 @@ from benchmarks.keypoint_bodies.clips import (
 from benchmarks.keypoint_bodies.joint_filters import project_one
 from benchmarks.keypoint_bodies.lifters import placed
 from benchmarks.keypoint_bodies.lifting import fit_shipped
+from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples
 from benchmarks.keypoint_bodies.methods import METHODS, OURS
 from benchmarks.keypoint_bodies.real import predicted, read_filmed
 from benchmarks.keypoint_bodies.scoring import Estimate, bone_spread, score
+from benchmarks.keypoint_bodies.seats import seated
 from benchmarks.keypoint_bodies.triangulation import (
     held,
     interpolated,
@@ -206,6 +208,17 @@ def test_quick_run_prints_every_peer(run_here, tmp_path):
     assert (tmp_path / "keypoint_bodies.md").read_text().split() == printed.split()
 
 
+def test_quick_run_prints_people_who_sit(run_here):
+    data = data_dir_or_skip(MHAD).parent
+    for name in (WALKS, ACTIONS):
+        data_dir_or_skip(name)
+    options = ("--data", str(data), "--quick", "--sitting", "--methods", "kalman", "pose2sim")
+    printed = run_here("keypoint_bodies.__main__", *options)
+    for row in ("front", "oblique", "side"):
+        assert f"| kalman *, {row} |" in printed and f"| kalman *, {row}, no knees |" in printed
+    assert "pose2sim" not in printed  # takes several cameras
+
+
 def test_turned_rings_see_the_same_body_from_other_sides(walker):
     ahead, beside = (see(walker, faults=CLEAN, turn=turn) for turn in (0.0, 90.0))
     first, second = (clip.rig.rotation[0, 2] for clip in (ahead, beside))
@@ -221,6 +234,42 @@ def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_siz
     network = LiftingNetwork.load(tmp_path / "lifting.safetensors")
     assert network.info.recordings == ("mocap_cmu_walk/s02_*", "kinect_utd_mhad/s01_*")
     assert 0.6 < network.info.legs < 1.0
+
+
+def test_people_are_put_into_seats_with_their_bones_and_their_arms(walker):
+    joints, up = walker.joints.float()[None].repeat(50, 1, 1, 1), walker.up.float().expand(50, 3)
+    found = seated(joints, up, torch.Generator().manual_seed(0))
+    again = seated(joints, up, torch.Generator().manual_seed(0))
+    assert torch.equal(found, again) and not torch.equal(found[0], found[1])
+    for joint, parent in enumerate(BODY_15.parents):
+        if parent >= 0:
+            lengths = [(x[..., joint, :] - x[..., parent, :]).norm(dim=-1) for x in (found, joints)]
+            torch.testing.assert_close(*lengths, atol=1e-4, rtol=1e-4)
+    hip, knee, ankle = (BODY_15.joint(f"left_{name}") for name in ("hip", "knee", "ankle"))
+    across = joints[:, :, hip] - joints[:, :, BODY_15.joint("right_hip")]
+    ahead = torch.linalg.cross(across, up[:, None].expand_as(across))
+    thigh, shank = (found[:, :, b] - found[:, :, a] for a, b in ((hip, knee), (knee, ankle)))
+    assert bool(((thigh * ahead).sum(-1) > 0).all())  # knees are in front
+    low, under = ((bone * up[:, None]).sum(-1) / bone.norm(dim=-1) for bone in (thigh, shank))
+    assert -0.3 < float(low.mean()) < 0.1
+    assert float(under.mean()) < -0.8
+    path = found[:, :, BODY_15.joint("pelvis")]
+    torch.testing.assert_close(path, path[:, :1].expand_as(path))
+
+
+def test_nobody_sits_unless_seats_are_asked_for_and_then_desks_hide_more_legs(walker):
+    sets = [(1.0, [walker])]
+    ankle, pelvis = BODY_15.joint("left_ankle"), BODY_15.joint("pelvis")
+    standing, sitting = (LiftingExamples(sets, 0, seats) for seats in (0.0, 1.0))
+    drops, hidden = [], []
+    for draw in (standing, sitting):
+        pieces = [draw() for _ in range(4)]
+        seen, joints = (torch.cat(values) for values in zip(*pieces, strict=True))
+        drops.append((joints[:, :, ankle] - joints[:, :, pelvis])[..., 1].mean())
+        there = seen[..., 2 * len(BODY_15.names) + ankle]
+        hidden.append((there == 0).all(1).float().mean())
+    assert drops[0] > 0.7 > 0.55 > drops[1]  # metres, downwards in the image
+    assert hidden[0] < 0.25 < 0.35 < hidden[1]
 
 
 def test_heights_of_cameras_are_told_rightly_and_wrongly(walker):
