@@ -6,6 +6,7 @@ import torch
 
 import torchpose
 from benchmarks.keypoint_bodies.clips import MHAD, begun, read_clips
+from benchmarks.keypoint_bodies.sitting import sitting_clips
 from tests.data import data_dir_or_skip
 from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, ring, scene
 from torchpose.body import BODY_15, Body
@@ -33,6 +34,7 @@ from torchpose.whole_body._keypoints.lifting_network import (
 )
 
 PELVIS = BODY_15.joint("pelvis")
+KNEES = [BODY_15.joint("left_knee"), BODY_15.joint("right_knee")]
 LIMBS = [
     i for i, name in enumerate(BODY_15.names) if name.endswith(("elbow", "wrist", "knee", "ankle"))
 ]
@@ -229,6 +231,25 @@ def test_strangers_are_nearer_than_the_best_still_pose():
         )
         assert error < 0.08
         assert error < still
+
+
+def test_knees_of_strangers_who_sit_are_in_front_of_them():
+    """A camera in front of them shows thighs short: they are neither short nor half upright."""
+    data = data_dir_or_skip(MHAD).parent
+    off, ahead = [], []
+    for clip in map(begun, sitting_clips(data)["front"]):
+        if "1.3 m" not in clip.name:
+            continue
+        seen = clip.seen
+        track = torchpose.BodyTracker(clip.rig, "kalman", fps=clip.fps)(
+            keypoints=seen.keypoints, confidence=seen.confidence, names=NAMES
+        )
+        found, truth = (relative(x)[..., KNEES, :] for x in (track.joints3d, clip.joints))
+        off.append((found - truth[track.first_frame :]).norm(dim=-1).mean())
+        ahead.append(-(found @ clip.rig.rotation[0, 2]).mean())
+    assert len(off) == 4
+    assert float(torch.stack(off).mean()) < 0.15
+    assert float(torch.stack(ahead).mean()) > 0.25
 
 
 def test_steps_are_lifted_as_whole_sequences_are():
