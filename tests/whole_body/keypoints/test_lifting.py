@@ -34,6 +34,7 @@ from torchpose.whole_body._keypoints.lifting_network import (
 )
 
 PELVIS = BODY_15.joint("pelvis")
+LEGS = [i for i, name in enumerate(BODY_15.names) if name.endswith(("knee", "ankle"))]
 KNEES = [BODY_15.joint("left_knee"), BODY_15.joint("right_knee")]
 LIMBS = [
     i for i, name in enumerate(BODY_15.names) if name.endswith(("elbow", "wrist", "knee", "ankle"))
@@ -233,23 +234,20 @@ def test_strangers_are_nearer_than_the_best_still_pose():
         assert error < still
 
 
-def test_knees_of_strangers_who_sit_are_in_front_of_them():
-    """A camera in front of them shows thighs short: they are neither short nor half upright."""
-    data = data_dir_or_skip(MHAD).parent
-    off, ahead = [], []
-    for clip in map(begun, sitting_clips(data)["front"]):
-        if "1.3 m" not in clip.name:
-            continue
-        seen = clip.seen
+def test_strangers_behind_a_desk_may_sit():
+    """Nobody sees their legs: knees are guessed between those of people who stand and who sit."""
+    clips = sitting_clips(data_dir_or_skip(MHAD).parent)["side"]
+    off = []
+    for clip in (begun(one) for one in clips if "1.3 m" in one.name):
+        keypoints = clip.seen.keypoints.clone()
+        keypoints[..., LEGS, :] = torch.nan
         track = torchpose.BodyTracker(clip.rig, "kalman", fps=clip.fps)(
-            keypoints=seen.keypoints, confidence=seen.confidence, names=NAMES
+            keypoints=keypoints, confidence=clip.seen.confidence, names=NAMES
         )
         found, truth = (relative(x)[..., KNEES, :] for x in (track.joints3d, clip.joints))
         off.append((found - truth[track.first_frame :]).norm(dim=-1).mean())
-        ahead.append(-(found @ clip.rig.rotation[0, 2]).mean())
     assert len(off) == 4
-    assert float(torch.stack(off).mean()) < 0.15
-    assert float(torch.stack(ahead).mean()) > 0.25
+    assert float(torch.stack(off).mean()) < 0.3  # 0.37 by a network that saw few who sit
 
 
 def test_steps_are_lifted_as_whole_sequences_are():

@@ -180,7 +180,7 @@ def test_covariances_of_legs_grow_while_they_are_hidden(smoothing):
     std = ankle.sum(-1).sqrt()
     last = {"none": 19, "full": 12}[smoothing]  # smoothed, legs that will be seen are known too
     assert float(std[last]) > 1.8 * float(std[4])
-    assert float(std[20]) < 1.1 * float(std[4])  # a keypoint is enough
+    assert float(std[20]) < 1.2 * float(std[4])  # a keypoint is enough
 
 
 def test_until_seen_counts_the_frames_to_the_next_keypoint():
