@@ -38,7 +38,7 @@ def seated(
     Args:
         joints: of pieces of recordings, metres. up: of their rooms. generator: of seats.
     """
-    draw = _Angles(*joints.shape[:2], generator)
+    draw = _Angles(joints.shape[0], joints.shape[1], generator)
     bodies = joints - joints[:, :, [_PELVIS]] + joints[:, :1, [_PELVIS]]
     upward = up[:, None, None].expand(*joints.shape[:2], 1, 3)
     across = bodies[:, :, _HIPS[:1]] - bodies[:, :, _HIPS[1:]]
