@@ -240,7 +240,7 @@ class Films:
 
     def _projected(self, points: "Tensor", poses: "BodyTrack", at: int, c: int) -> "Tensor":
         """Return the pixels of points of a pose in camera c, which is turned as its keypoints say."""
-        from torchpose.whole_body._keypoints.keypoint_body_tracker import CAMERA_TURN
+        from torchpose.whole_body._keypoints.track_builder import CAMERA_TURN
 
         camera = self._cameras[c]
         if CAMERA_TURN in poses.details:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
-from torchpose.whole_body._keypoints.keypoint_body_tracker import KEYPOINT_METHOD
+from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 
 
 def given_of(arguments: Mapping[str, Any]) -> dict[str, Any]:

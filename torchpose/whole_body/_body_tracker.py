@@ -48,13 +48,10 @@ from torchpose.whole_body._filter_table import (
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._following import Observed
-from torchpose.whole_body._keypoints.keypoint_body_tracker import (
-    KEYPOINT_METHOD,
-    KeypointBodyTracker,
-    LiveBody,
-)
+from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker, LiveBody
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
+from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 from torchpose.whole_body._measured_keypoints import given_keypoints
 from torchpose.whole_body._particle_follower import ParticleFollower
 

@@ -83,7 +83,7 @@ class BodyKeypointMeasurer:
             ShapeError, InputError, CameraError: as `BodyTracker.forward`.
         """
         check_shape("keypoints", given.keypoints, ["T", len(self.tracker.rig), None, 2])
-        return self.tracker.frames(*given)
+        return self.tracker.reader.frames(*given)
 
     def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
         """Return the measurement of one frame, of one element."""

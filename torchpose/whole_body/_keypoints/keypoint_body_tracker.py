@@ -4,39 +4,29 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import (
-    MOST_CONFIDENCE,
     check_choice,
     check_height,
-    check_pixels,
     check_positive,
     check_shape,
     number_of,
-    refuse_half,
 )
-from torchpose.body._feet import ANKLES, FEET, foot_points
+from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._kinematics import Body
-from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
-from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeError
+from torchpose.errors import InputError, NobodySeenError, ShapeError
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._foot_prior import shipped_foot_prior
 from torchpose.priors._shipped import load_body_motion
-from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_conventions import check_conventions
-from torchpose.whole_body._keypoints.camera_notes import (
-    doubt_cameras,
-    notes_on_cameras,
-    notes_on_refined,
-)
-from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_notes import notes_on_refined
 from torchpose.whole_body._keypoints.camera_refinement import (
     REFINED,
     RefinedCameras,
@@ -52,17 +42,11 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 from torchpose.whole_body._keypoints.keypoint_notes import (
     TOO_FEW,
     late_note,
-    notes_of,
-    notes_on_a_rolled_camera,
     notes_on_cameras_now,
-    notes_on_left_out_cameras,
-    notes_on_size,
     notes_on_still_cameras,
-    notes_on_turned_cameras,
-    notes_on_up,
-    notes_on_upside_down_cameras,
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
+from torchpose.whole_body._keypoints.keypoint_reader import KeypointReader
 from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS, KeypointTracker
 from torchpose.whole_body._keypoints.known_person import (
     of_one_camera,
@@ -72,22 +56,15 @@ from torchpose.whole_body._keypoints.known_person import (
 )
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
-from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
+from torchpose.whole_body._keypoints.track_builder import TrackBuilder, without_poses
+from torchpose.whole_body._keypoints.turned_cameras import angles_of
 
 T = TypeVar("T")
-KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
-INLIER = (0.05, 0.97)
-"""Least and largest prior probability that a keypoint is its joint's."""
 PIXEL_STD = 1.0
 """Pixels, how far keypoints are from projected joints, beside what they are off in space."""
-_LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _KEYPOINT_STD = 0.012  # metres
 _KEYPOINT_STD_OF_ONE = 0.03  # where no other camera corrects errors that stay from frame to frame
-CAMERA_TURN = "camera_turn"
-"""Name of the detail of cameras that are turned, there where any is."""
-COVARIANCE_FROM_PELVIS = "covariance_from_pelvis"
-"""Name of the detail of one camera."""
 _HIGHEST_CAMERA = 30.0  # metres above the floor
 _DOUBT_OF_LEGS = 2.0  # of several cameras, in which toes are seen well and a body may be astray
 _LASTING_OF_ONE = 2 / 3  # of the deviation of keypoints, what lasts in one camera
@@ -135,8 +112,9 @@ class KeypointBodyTracker(nn.Module):
         std_of_one = _KEYPOINT_STD_OF_ONE if keypoint_std is None else keypoint_std
         if keypoint_std is None:
             keypoint_std = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
-        self.keypoint_std = check_positive("keypoint_std", keypoint_std)
-        self.pixel_std = check_positive("pixel_std", PIXEL_STD if pixel_std is None else pixel_std)
+        keypoint_std = check_positive("keypoint_std", keypoint_std)
+        pixel_std = check_positive("pixel_std", PIXEL_STD if pixel_std is None else pixel_std)
+        self.reader = KeypointReader(rig, keypoint_std, pixel_std)
         motion = load_body_motion("whole-body") if motion is None else motion
         if body is not None:
             motion = with_body(motion, body)
@@ -145,13 +123,14 @@ class KeypointBodyTracker(nn.Module):
         size_std = std_of_legs(motion) if alone else 0.0
         if alone:
             motion = of_one_camera(motion)
-        self.sized = body is not None or height is not None or camera_height is not None
-        lasting = _LASTING_OF_ONE * self.keypoint_std if alone else 0.0
+        sized = body is not None or height is not None or camera_height is not None
+        lasting = _LASTING_OF_ONE * keypoint_std if alone else 0.0
         self.tracker = KeypointTracker(
             rig, self.fps, motion, up=up, lasting_std=lasting,
-            lone=LoneNoise((std_of_one / self.keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
+            lone=LoneNoise((std_of_one / keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
             size_std=size_std, camera_height=camera_height,
         )  # fmt: skip
+        self.builder = TrackBuilder(self.tracker, rig, self.fps, sized)
         self.feet = FootFilter(
             motion.articulation, copy.deepcopy(shipped_foot_prior()), self.fps,
             doubt=1.0 if alone else _DOUBT_OF_LEGS,
@@ -186,7 +165,7 @@ class KeypointBodyTracker(nn.Module):
             raise InputError(
                 f"keypoints must hold at least one sequence, got {list(keypoints.shape)}"
             )
-        frames, feet = self.frames_and_feet(keypoints, confidence, names, covariance)
+        frames, feet = self.reader.frames_and_feet(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
         if single:
             frames = frames.map(lambda value: value[None])
@@ -202,7 +181,7 @@ class KeypointBodyTracker(nn.Module):
         poses = self.tracker(frames, smoothing == "full", progress)
         found = self.feet_of(poses, feet, smoothing == "full")
         tracks = [
-            self.track(poses, frames, b, cameras=b == 0, feet=found)
+            self.builder.track(poses, frames, b, cameras=b == 0, feet=found)
             for b in range(len(frames.pixels))
         ]
         for track in tracks:
@@ -221,7 +200,7 @@ class KeypointBodyTracker(nn.Module):
     ) -> tuple[LiveBody, BodyTrack]:
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
-        frame, feet = self.frames_and_feet(keypoints, confidence, names, covariance)
+        frame, feet = self.reader.frames_and_feet(keypoints, confidence, names, covariance)
         frame = frame.map(lambda value: value[None])
         before, standing = (None, None) if stream is None else stream
         body, pose, _ = self.tracker.advance(before, frame)
@@ -233,12 +212,12 @@ class KeypointBodyTracker(nn.Module):
             standing, found = step_feet(self.feet, standing, self.tracker.filter.maps, pose, feet)
             found = with_time(found)
         frames = frame.map(lambda value: value[:, None])
-        track = self.track(with_time(pose), frames, 0, summed_up=False, feet=found)
+        track = self.builder.track(with_time(pose), frames, 0, summed_up=False, feet=found)
         faults = mapped(lambda value: value[0], body.faults)
         track.notes = notes_on_cameras_now(
             self.rig.names, faults.still, faults.off, angles_of(faults.turn)
         )
-        return LiveBody(body, standing), track if bool(body.begun) else _unknown(track)
+        return LiveBody(body, standing), track if bool(body.begun) else without_poses(track)
 
     def feet_of(
         self, poses: KeypointPoses, frames: KeypointFrame | None, smoothing: bool
@@ -247,6 +226,30 @@ class KeypointBodyTracker(nn.Module):
         if frames is None:
             return None
         return track_feet(self.feet, self.tracker.filter.maps, poses, frames, smoothing)
+
+    def first_frames(self, frames: KeypointFrame) -> list[int]:
+        """Return the frames in which sequences begin.
+
+        Args:
+            frames: [B, T, C, J, ...].
+
+        Raises:
+            NobodySeenError: one of them never does.
+        """
+        seen = (frames.inlier > 0).flatten(1).any(-1)
+        if not bool(seen.all()):
+            raise NobodySeenError(
+                f"sequence {int((~seen).nonzero()[0])} has no keypoint in any camera and frame"
+            )
+        begun = self.tracker.first_frames(frames).tolist()
+        n_frames = frames.pixels.shape[1]
+        if n_frames in begun:
+            where = "" if len(self.rig) == 1 else " in two cameras, nor in one for half a second"
+            raise NobodySeenError(
+                f"sequence {begun.index(n_frames)} has no frame with keypoints of {LEAST_JOINTS} "
+                f"joints or more{where}; check the keypoints and their names"
+            )
+        return begun
 
     # --- cameras ----------------------------------------------------------------------------------
 
@@ -302,7 +305,7 @@ class KeypointBodyTracker(nn.Module):
         found = found._replace(poses=found.poses._replace(off=off))
         moved = found.frames.map(lambda value: value[None])
         standing = self._refined_feet(feet, found, smoothing)
-        result = self.track(
+        result = self.builder.track(
             found.poses, moved, 0, refined=found, first_frame=first_frame, feet=standing
         )
         late = late_note(result.first_frame, TOO_FEW)
@@ -340,213 +343,6 @@ class KeypointBodyTracker(nn.Module):
         frames = moved.map(lambda value: value[None])
         return track_feet(self.feet, RigMaps.of(found.rig), found.poses, frames, smoothing)
 
-    # --- keypoints --------------------------------------------------------------------------------
-
-    def frames(
-        self,
-        keypoints: Tensor,
-        confidence: Tensor | None,
-        names: Sequence[str] | None,
-        covariance: Tensor | None,
-    ) -> KeypointFrame:
-        """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
-        return self.frames_and_feet(keypoints, confidence, names, covariance)[0]
-
-    def frames_and_feet(
-        self,
-        keypoints: Tensor,
-        confidence: Tensor | None,
-        names: Sequence[str] | None,
-        covariance: Tensor | None,
-    ) -> tuple[KeypointFrame, KeypointFrame | None]:
-        """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them."""
-        refuse_half("keypoints", keypoints)
-        names = _names_of(keypoints, names)
-        shape = keypoints.shape[:-1]
-        for name, value in (("confidence", confidence), ("covariance", covariance)):
-            if value is not None:
-                check_shape(name, value, list(shape))
-        points = keypoints.to(self.rig.matrix)
-        trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
-        trust = trust.nan_to_num(0.0)
-        known = torch.isfinite(points).all(-1)
-        outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
-        if bool(outside.any()):
-            raise InputError(
-                f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "
-                "divide scores in percent by 100"
-            )
-        trust = trust.clamp(0.0, 1.0)
-        there = known & (trust > 0)
-        own = self.pixel_std**2 * torch.ones_like(trust)
-        relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
-        if covariance is not None:
-            own, relative = covariance.to(points), torch.zeros_like(trust)
-            if not bool((own[there] > 0).all()):
-                raise InputError("covariance of keypoints must be positive, pixels squared")
-        inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
-        table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
-        table = table.masked_fill(~there[..., None], torch.nan)
-        body, feet = body_joints(table, names), foot_points(table, names)
-        self._check_inside(_pixels_of(body))
-        if feet is None:
-            return self._undistorted(body), None
-        n_joints = body.shape[-2]
-        both = self._undistorted(torch.cat([body, feet], -2))
-        axis = len(shape) - 1
-        n_points = both.inlier.shape[-1]
-        return (
-            both.map(lambda value: value.narrow(axis, 0, n_joints)),
-            both.map(lambda value: value.narrow(axis, n_joints, n_points - n_joints)),
-        )
-
-    def _undistorted(self, table: Float[Tensor, "*batch C J 5"]) -> KeypointFrame:
-        """Return keypoints of a table of pixels, both parts of the noise, and trust."""
-        pixels = self.rig.undistort_points(_pixels_of(table))
-        known = pixels.isfinite().all(-1)  # some pixels are of no ray through the lens
-        own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
-        return KeypointFrame(
-            pixels.nan_to_num(), own, relative, torch.where(known, inlier, 0.0)
-        )  # fmt: skip
-
-    def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
-        """Refuse shares of an image, and keypoints most of which lie far outside it: of another size."""
-        sides = [(torch.inf, torch.inf) if size is None else size[::-1] for size in self.rig.sizes]
-        side = torch.tensor(sides).to(pixels)[:, None]
-        there = pixels.isfinite().all(-1)
-        check_pixels("keypoints", pixels, there)
-        outside = ((pixels < -side / 2) | (pixels > 1.5 * side)).any(-1) & there
-        wrong, every = (value.movedim(-2, 0).flatten(1).sum(1) for value in (outside, there))
-        most = (2 * wrong > every).tolist()
-        for name, size, refused in zip(self.rig.names, self.rig.sizes, most, strict=True):
-            if refused and size is not None:
-                raise CameraError(
-                    f"most keypoints of camera {name!r} lie outside its image of {size[1]} x "
-                    f"{size[0]} pixels; if they are of a video of another size, take "
-                    "rig.scaled(height, width)"
-                )
-
-    def first_frames(self, frames: KeypointFrame) -> list[int]:
-        """Return the frames in which sequences begin.
-
-        Args:
-            frames: [B, T, C, J, ...].
-
-        Raises:
-            NobodySeenError: one of them never does.
-        """
-        seen = (frames.inlier > 0).flatten(1).any(-1)
-        if not bool(seen.all()):
-            raise NobodySeenError(
-                f"sequence {int((~seen).nonzero()[0])} has no keypoint in any camera and frame"
-            )
-        begun = self.tracker.first_frames(frames).tolist()
-        n_frames = frames.pixels.shape[1]
-        if n_frames in begun:
-            where = "" if len(self.rig) == 1 else " in two cameras, nor in one for half a second"
-            raise NobodySeenError(
-                f"sequence {begun.index(n_frames)} has no frame with keypoints of {LEAST_JOINTS} "
-                f"joints or more{where}; check the keypoints and their names"
-            )
-        return begun
-
-    # --- poses ------------------------------------------------------------------------------------
-
-    def track(
-        self,
-        poses: KeypointPoses,
-        frames: KeypointFrame,
-        b: int,
-        summed_up: bool = True,
-        cameras: bool = True,
-        refined: RefinedCameras | None = None,
-        first_frame: int = 0,
-        feet: FootPoses | None = None,
-    ) -> BodyTrack:
-        """Return the track of one element of the batch, from the frame on in which it begins."""
-        live = poses.started.shape[1] == 1
-        begun = 0 if live else int(poses.started[b].int().argmax())
-        poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
-        standing: dict[str, Tensor] = {}
-        if self.tracker.only is not None:
-            standing[COVARIANCE_FROM_PELVIS] = self.tracker.only.covariance_from_pelvis(poses)
-        if feet is not None:
-            own = mapped(lambda value: value[b, begun:], feet)
-            standing |= dict(zip(DETAILS_OF_FEET, own, strict=True))
-        if bool(is_turned(poses.turn).any()):
-            standing[CAMERA_TURN] = poses.turn
-        first_frame += begun
-        body = self.tracker.filter.articulation
-        bones = body.bones(poses.point)
-        rigid = _rigid_body(bones, ~poses.coasting)
-        state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
-        notes: tuple[str, ...] = ()
-        if summed_up:
-            notes = self._notes(poses, frame, cameras, refined, first_frame)
-            notes += notes_on_size(rigid.height, len(self.rig), self.sized)
-        return BodyTrack(
-            rigid,
-            state,
-            self._state_std(poses.state_cov),
-            poses.joints,
-            poses.covariance,
-            poses.log_evidence,
-            torch.full_like(poses.log_evidence, torch.nan),
-            poses.coasting,
-            poses.started & (poses.started.cumsum(0) > 1),
-            self.fps,
-            notes=notes,
-            first_frame=first_frame,
-            details={
-                "inlier": poses.inlier,
-                "exchanged": poses.exchanged,
-                "bone_lengths": bones.norm(dim=-1),
-                **standing,
-            },
-            method=KEYPOINT_METHOD,
-        )
-
-    def _state_std(self, cov: Float[Tensor, "T N N"]) -> Float[Tensor, "T 36"]:
-        """Return standard deviations in the units of a state: metres, and sines of half angles."""
-        body = self.tracker.filter.articulation
-        std = cov.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-        turns = std.new_zeros(len(std), len(BODY_15.parts), 3)
-        turns[:, body.axis_part, body.axis] = std[:, body.columns["rotations"]] / 2
-        return torch.cat([std[:, body.columns["position"]], turns.flatten(1)], -1)
-
-    def _notes(
-        self,
-        poses: KeypointPoses,
-        frame: KeypointFrame,
-        cameras: bool,
-        refined: RefinedCameras | None,
-        first_frame: int,
-    ) -> tuple[str, ...]:
-        there = frame.inlier > 0
-        notes = notes_of(
-            self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
-            poses.off, self.sized, first_frame,
-        )  # fmt: skip
-        notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
-        notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)
-        notes += notes_on_up(self.tracker.filter.up, poses.joints)
-        turned = notes_on_turned_cameras(self.rig.names, angles_of(poses.turn), first_frame)
-        notes += notes_on_left_out_cameras(self.rig.names, poses.off, first_frame) + turned
-        if len(self.rig) == 1 and self.tracker.filter.up is None:
-            rolled = notes_on_a_rolled_camera(self.rig.names[0], frame.pixels[:, 0], there[:, 0])
-            return notes + rolled
-        if len(self.rig) == 1 or not cameras:
-            return notes
-        order = notes_on_order(self.rig.names, self.tracker.filter.maps, frame)
-        if order:
-            return (*order, *notes)
-        rig = self.rig if refined is None else refined.rig
-        exchange = self.tracker.filter.exchange
-        doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
-        if turned:  # that is said already
-            doubts = doubts._replace(turns=torch.zeros_like(doubts.turns))
-        return (*notes, *notes_on_cameras(self.rig.names, doubts))
-
 
 def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -> None:
     """Raise `InputError` unless a height of the camera, if there is one, can tell the size of a person."""
@@ -567,52 +363,6 @@ def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -
             "camera_height tells how far below the camera the floor is, and which way is down is not known; "
             'give up as well, "y" or "z", the axis of the cameras\' world that points up'
         )
-
-
-def _names_of(keypoints: Tensor, names: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of keypoints [..., J, 2], those of `BODY_15` if none are given."""
-    found = BODY_15.names if names is None else tuple(names)
-    if keypoints.shape[-2:] != (len(found), 2):
-        of = "BODY_15, whose names count where none are given" if names is None else "names"
-        raise ShapeError(
-            f"keypoints must have shape [..., {len(found)}, 2], as many as {of}, got "
-            f"{list(keypoints.shape)}"
-        )
-    return found
-
-
-def _pixels_of(table: Float[Tensor, "*batch C J 5"]) -> Float[Tensor, "*batch C J 2"]:
-    """Return the pixels of a table, NaN where there is no keypoint."""
-    return torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
-
-
-def _rigid_body(bones: Float[Tensor, "T J 3"], measured: Bool[Tensor, " T"]) -> Body:
-    """Return the body of a track: the median bone of every joint in the axes of the part that carries it.
-
-    Frames without a measurement count where there are no others.
-    """
-    if len(bones) > 1 and bool(measured.any()):
-        bones = bones[measured]
-    middle = bones.median(0).values
-    middle[0] = 0
-    lengths = middle.norm(dim=-1)
-    height = BODY_15.height(lengths)
-    radii = BODY_15.standard_radii(height).to(lengths)
-    return Body(BODY_15, lengths, radii, directions=middle)
-
-
-def _unknown(track: BodyTrack) -> BodyTrack:
-    """Return a track without poses: NaN in place of what is not known before the first one."""
-    names = ("state", "state_std", "joints3d", "covariance3d", "log_evidence")
-    values: dict[str, Any] = {
-        name: torch.full_like(getattr(track, name), torch.nan) for name in names
-    }
-    details = {
-        name: torch.full_like(value, torch.nan)
-        for name, value in track.details.items()
-        if name in (*SIZES_OF_FEET, COVARIANCE_FROM_PELVIS)
-    }
-    return replace(track, **values, details={**track.details, **details})
 
 
 def with_time(poses: T) -> T:

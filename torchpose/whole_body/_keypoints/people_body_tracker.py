@@ -162,7 +162,7 @@ class PeopleBodyTracker:
     ) -> tuple[KeypointFrame, KeypointFrame | None]:
         """Return the detections of bodies and of feet as frames [..., D, C, J]."""
         trust, cov = (None if v is None else v.transpose(-3, -2) for v in (confidence, covariance))
-        both = self.single.frames_and_feet(keypoints.transpose(-4, -3), trust, names, cov)
+        both = self.single.reader.frames_and_feet(keypoints.transpose(-4, -3), trust, names, cov)
         body, feet = (
             one if one is None or one.inlier.shape[-3] else _with_an_empty_one(one) for one in both
         )
@@ -234,7 +234,7 @@ class PeopleBodyTracker:
         found = [taken(row.frame, torch.tensor([row.row])) for row in rows]
         poses = stacked([one.poses for one in found]) if poses is None else poses
         keypoints: KeypointFrame = stacked([one.keypoints for one in found])
-        track = self.single.track(
+        track = self.single.builder.track(
             poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet
         )
         track.details["detection"] = torch.cat([one.detection for one in found])

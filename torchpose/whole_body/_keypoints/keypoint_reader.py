@@ -1,0 +1,131 @@
+"""Read the keypoints of a detector as pixels of the body's joints and feet, with their noise and trust."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose._core.checks import MOST_CONFIDENCE, check_pixels, check_shape, refuse_half
+from torchpose.body._feet import foot_points
+from torchpose.body._skeleton import BODY_15, body_joints
+from torchpose.camera._rig import CameraRig
+from torchpose.errors import CameraError, InputError, ShapeError
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+
+INLIER = (0.05, 0.97)
+"""Least and largest prior probability that a keypoint is its joint's."""
+_LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
+
+
+class KeypointReader:
+    """Reads keypoints of the images of a rig.
+
+    Args:
+        rig: the cameras. keypoint_std: metres, how far a detector's joints are from the body's, along each
+            axis. pixel_std: pixels, how far they are apart from that.
+    """
+
+    def __init__(self, rig: CameraRig, keypoint_std: float, pixel_std: float) -> None:
+        self.rig, self.keypoint_std, self.pixel_std = rig, keypoint_std, pixel_std
+
+    def frames(
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        names: Sequence[str] | None,
+        covariance: Tensor | None,
+    ) -> KeypointFrame:
+        """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
+        return self.frames_and_feet(keypoints, confidence, names, covariance)[0]
+
+    def frames_and_feet(
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        names: Sequence[str] | None,
+        covariance: Tensor | None,
+    ) -> tuple[KeypointFrame, KeypointFrame | None]:
+        """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them."""
+        refuse_half("keypoints", keypoints)
+        names = _names_of(keypoints, names)
+        shape = keypoints.shape[:-1]
+        for name, value in (("confidence", confidence), ("covariance", covariance)):
+            if value is not None:
+                check_shape(name, value, list(shape))
+        points = keypoints.to(self.rig.matrix)
+        trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
+        trust = trust.nan_to_num(0.0)
+        known = torch.isfinite(points).all(-1)
+        outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
+        if bool(outside.any()):
+            raise InputError(
+                f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "
+                "divide scores in percent by 100"
+            )
+        trust = trust.clamp(0.0, 1.0)
+        there = known & (trust > 0)
+        own = self.pixel_std**2 * torch.ones_like(trust)
+        relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
+        if covariance is not None:
+            own, relative = covariance.to(points), torch.zeros_like(trust)
+            if not bool((own[there] > 0).all()):
+                raise InputError("covariance of keypoints must be positive, pixels squared")
+        inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
+        table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
+        table = table.masked_fill(~there[..., None], torch.nan)
+        body, feet = body_joints(table, names), foot_points(table, names)
+        self._check_inside(_pixels_of(body))
+        if feet is None:
+            return self._undistorted(body), None
+        n_joints = body.shape[-2]
+        both = self._undistorted(torch.cat([body, feet], -2))
+        axis = len(shape) - 1
+        n_points = both.inlier.shape[-1]
+        return (
+            both.map(lambda value: value.narrow(axis, 0, n_joints)),
+            both.map(lambda value: value.narrow(axis, n_joints, n_points - n_joints)),
+        )
+
+    def _undistorted(self, table: Float[Tensor, "*batch C J 5"]) -> KeypointFrame:
+        """Return keypoints of a table of pixels, both parts of the noise, and trust."""
+        pixels = self.rig.undistort_points(_pixels_of(table))
+        known = pixels.isfinite().all(-1)  # some pixels are of no ray through the lens
+        own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
+        return KeypointFrame(
+            pixels.nan_to_num(), own, relative, torch.where(known, inlier, 0.0)
+        )  # fmt: skip
+
+    def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
+        """Refuse shares of an image, and keypoints most of which lie far outside it: of another size."""
+        sides = [(torch.inf, torch.inf) if size is None else size[::-1] for size in self.rig.sizes]
+        side = torch.tensor(sides).to(pixels)[:, None]
+        there = pixels.isfinite().all(-1)
+        check_pixels("keypoints", pixels, there)
+        outside = ((pixels < -side / 2) | (pixels > 1.5 * side)).any(-1) & there
+        wrong, every = (value.movedim(-2, 0).flatten(1).sum(1) for value in (outside, there))
+        most = (2 * wrong > every).tolist()
+        for name, size, refused in zip(self.rig.names, self.rig.sizes, most, strict=True):
+            if refused and size is not None:
+                raise CameraError(
+                    f"most keypoints of camera {name!r} lie outside its image of {size[1]} x "
+                    f"{size[0]} pixels; if they are of a video of another size, take "
+                    "rig.scaled(height, width)"
+                )
+
+
+def _names_of(keypoints: Tensor, names: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of keypoints [..., J, 2], those of `BODY_15` if none are given."""
+    found = BODY_15.names if names is None else tuple(names)
+    if keypoints.shape[-2:] != (len(found), 2):
+        of = "BODY_15, whose names count where none are given" if names is None else "names"
+        raise ShapeError(
+            f"keypoints must have shape [..., {len(found)}, 2], as many as {of}, got "
+            f"{list(keypoints.shape)}"
+        )
+    return found
+
+
+def _pixels_of(table: Float[Tensor, "*batch C J 5"]) -> Float[Tensor, "*batch C J 2"]:
+    """Return the pixels of a table, NaN where there is no keypoint."""
+    return torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)

@@ -1,0 +1,175 @@
+"""Make a `BodyTrack` of filtered poses: one person's, with a rigid body, details and notes."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
+from torchpose.camera._rig import CameraRig
+from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
+from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.camera_notes import doubt_cameras, notes_on_cameras
+from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_refinement import RefinedCameras
+from torchpose.whole_body._keypoints.foot_filter import FootPoses
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_notes import (
+    notes_of,
+    notes_on_a_rolled_camera,
+    notes_on_left_out_cameras,
+    notes_on_size,
+    notes_on_still_cameras,
+    notes_on_turned_cameras,
+    notes_on_up,
+    notes_on_upside_down_cameras,
+)
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
+from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
+
+KEYPOINT_METHOD = "kalman"
+CAMERA_TURN = "camera_turn"
+"""Name of the detail of cameras that are turned, there where any is."""
+COVARIANCE_FROM_PELVIS = "covariance_from_pelvis"
+"""Name of the detail of one camera."""
+
+
+class TrackBuilder:
+    """Makes tracks of what a filter found.
+
+    Args:
+        tracker: that found the poses. rig: its cameras. fps: frames per second.
+        sized: whether the size of the person was given.
+    """
+
+    def __init__(self, tracker: KeypointTracker, rig: CameraRig, fps: float, sized: bool) -> None:
+        self.tracker, self.rig, self.fps, self.sized = tracker, rig, fps, sized
+
+    def track(
+        self,
+        poses: KeypointPoses,
+        frames: KeypointFrame,
+        b: int,
+        summed_up: bool = True,
+        cameras: bool = True,
+        refined: RefinedCameras | None = None,
+        first_frame: int = 0,
+        feet: FootPoses | None = None,
+    ) -> BodyTrack:
+        """Return the track of one element of the batch, from the frame on in which it begins."""
+        live = poses.started.shape[1] == 1
+        begun = 0 if live else int(poses.started[b].int().argmax())
+        poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
+        standing: dict[str, Tensor] = {}
+        if self.tracker.only is not None:
+            standing[COVARIANCE_FROM_PELVIS] = self.tracker.only.covariance_from_pelvis(poses)
+        if feet is not None:
+            own = mapped(lambda value: value[b, begun:], feet)
+            standing |= dict(zip(DETAILS_OF_FEET, own, strict=True))
+        if bool(is_turned(poses.turn).any()):
+            standing[CAMERA_TURN] = poses.turn
+        first_frame += begun
+        body = self.tracker.filter.articulation
+        bones = body.bones(poses.point)
+        rigid = _rigid_body(bones, ~poses.coasting)
+        state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
+        notes: tuple[str, ...] = ()
+        if summed_up:
+            notes = self._notes(poses, frame, cameras, refined, first_frame)
+            notes += notes_on_size(rigid.height, len(self.rig), self.sized)
+        return BodyTrack(
+            rigid,
+            state,
+            self._state_std(poses.state_cov),
+            poses.joints,
+            poses.covariance,
+            poses.log_evidence,
+            torch.full_like(poses.log_evidence, torch.nan),
+            poses.coasting,
+            poses.started & (poses.started.cumsum(0) > 1),
+            self.fps,
+            notes=notes,
+            first_frame=first_frame,
+            details={
+                "inlier": poses.inlier,
+                "exchanged": poses.exchanged,
+                "bone_lengths": bones.norm(dim=-1),
+                **standing,
+            },
+            method=KEYPOINT_METHOD,
+        )
+
+    def _state_std(self, cov: Float[Tensor, "T N N"]) -> Float[Tensor, "T 36"]:
+        """Return standard deviations in the units of a state: metres, and sines of half angles."""
+        body = self.tracker.filter.articulation
+        std = cov.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+        turns = std.new_zeros(len(std), len(BODY_15.parts), 3)
+        turns[:, body.axis_part, body.axis] = std[:, body.columns["rotations"]] / 2
+        return torch.cat([std[:, body.columns["position"]], turns.flatten(1)], -1)
+
+    def _notes(
+        self,
+        poses: KeypointPoses,
+        frame: KeypointFrame,
+        cameras: bool,
+        refined: RefinedCameras | None,
+        first_frame: int,
+    ) -> tuple[str, ...]:
+        there = frame.inlier > 0
+        notes = notes_of(
+            self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
+            poses.off, self.sized, first_frame,
+        )  # fmt: skip
+        notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
+        notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)
+        notes += notes_on_up(self.tracker.filter.up, poses.joints)
+        turned = notes_on_turned_cameras(self.rig.names, angles_of(poses.turn), first_frame)
+        notes += notes_on_left_out_cameras(self.rig.names, poses.off, first_frame) + turned
+        if len(self.rig) == 1 and self.tracker.filter.up is None:
+            rolled = notes_on_a_rolled_camera(self.rig.names[0], frame.pixels[:, 0], there[:, 0])
+            return notes + rolled
+        if len(self.rig) == 1 or not cameras:
+            return notes
+        order = notes_on_order(self.rig.names, self.tracker.filter.maps, frame)
+        if order:
+            return (*order, *notes)
+        rig = self.rig if refined is None else refined.rig
+        exchange = self.tracker.filter.exchange
+        doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
+        if turned:  # that is said already
+            doubts = doubts._replace(turns=torch.zeros_like(doubts.turns))
+        return (*notes, *notes_on_cameras(self.rig.names, doubts))
+
+
+def without_poses(track: BodyTrack) -> BodyTrack:
+    """Return a track without poses: NaN in place of what is not known before the first one."""
+    names = ("state", "state_std", "joints3d", "covariance3d", "log_evidence")
+    values: dict[str, Any] = {
+        name: torch.full_like(getattr(track, name), torch.nan) for name in names
+    }
+    details = {
+        name: torch.full_like(value, torch.nan)
+        for name, value in track.details.items()
+        if name in (*SIZES_OF_FEET, COVARIANCE_FROM_PELVIS)
+    }
+    return replace(track, **values, details={**track.details, **details})
+
+
+def _rigid_body(bones: Float[Tensor, "T J 3"], measured: Bool[Tensor, " T"]) -> Body:
+    """Return the body of a track: the median bone of every joint in the axes of the part that carries it.
+
+    Frames without a measurement count where there are no others.
+    """
+    if len(bones) > 1 and bool(measured.any()):
+        bones = bones[measured]
+    middle = bones.median(0).values
+    middle[0] = 0
+    lengths = middle.norm(dim=-1)
+    height = BODY_15.height(lengths)
+    radii = BODY_15.standard_radii(height).to(lengths)
+    return Body(BODY_15, lengths, radii, directions=middle)
