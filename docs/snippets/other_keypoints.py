@@ -1,4 +1,3 @@
-import csv
 import json
 
 import numpy as np
@@ -34,19 +33,3 @@ np.savez(
 )  # fmt: skip
 print(read_keypoints("from_coco.npz").keypoints.shape)
 # > torch.Size([3, 17, 2])
-
-# DeepLabCut's .csv: three lines of header, then x, y and likelihood of each body part.
-with open("deeplabcut.csv", "w") as file:
-    file.write("scorer,net,net,net\nbodyparts,wrist1,wrist1,wrist1\ncoords,x,y,likelihood\n")
-    file.write("0,320.5,240.1,0.98\n1,321.0,240.3,0.97\n")
-joints = {"wrist1": "left_wrist"}  # what the body parts are called here
-with open("deeplabcut.csv") as file:
-    _, parts, _, *rows = csv.reader(file)
-numbers = np.array(rows, dtype=float)[:, 1:].reshape(len(rows), -1, 3)
-np.savez(
-    "from_deeplabcut.npz",
-    keypoints=numbers[..., :2], confidence=numbers[..., 2],
-    names=[joints[part] for part in parts[1::3]], fps=30, image_size=(1280, 720),
-)  # fmt: skip
-print(read_keypoints("from_deeplabcut.npz").names)
-# > ('left_wrist',)
