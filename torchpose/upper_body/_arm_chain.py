@@ -324,11 +324,23 @@ class ArmChain:
         prior = arms.log_prior[:, :, 0].exp()
         return _belief(arms, prior, prior, seen)
 
-    def update(self, state: ArmState, arms: Arms, seen: Bool[Tensor, "B 2"]) -> ArmState:
-        """Return the posterior after one more frame; see `start`."""
+    def update(
+        self,
+        state: ArmState,
+        arms: Arms,
+        seen: Bool[Tensor, "B 2"],
+        again: Bool[Tensor, " B"] | None = None,
+    ) -> ArmState:
+        """Return the posterior after one more frame; see `start`.
+
+        Args:
+            again: whose arms start again, as if it were their first frame; None is nobody.
+        """
         prior = arms.log_prior[:, :, 0].exp()
         moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0], seen)
         predicted = moved + self._anew(seen, prior) * (prior - moved)
+        if again is not None:
+            predicted = torch.where(again[:, None, None], prior, predicted)
         return _belief(arms, prior, predicted, seen)
 
     def _anew(self, seen: Bool[Tensor, "B 2"], like: Tensor) -> Float[Tensor, "B 2 1"]:

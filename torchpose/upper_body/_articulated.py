@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -53,6 +54,7 @@ from torchpose.upper_body._torso_likelihood import Root
 _SHARE = 0.2  # seconds over which frames say the same about lengths
 _SHARE_OF_TORSO = 0.6  # the same about the torso
 _UPDATE = 0.1  # seconds from one update of the torso to the next
+_BEGINNING = 0.5  # seconds after the first frame in which a body may start again
 _AT_ONCE = 32  # frames whose poses are read together
 
 
@@ -69,8 +71,9 @@ class ArticulatedState(NamedTuple):
         lean: the moments of the line between the shoulders (`seen_lean`), [B, 2]. tilt: the roll of the
             axes in which it is level, [B, 3, 3].
         frame: the number of frames before.
-        waiting: of whom no elbow or hand has been seen yet beside two joints of the torso, [B]; None if
-            of nobody. One joint has no size in the image, and so no depth that arms could rule out.
+        starts: the number of updates at which a body may still start, [B]; None if 0 for everybody. It starts
+            where an elbow or hand is seen beside two joints of the torso, since one joint has no size in the
+            image, and so no depth that arms could rule out; and starts again until the frame fits a body.
     """
 
     root: Tensor
@@ -83,7 +86,7 @@ class ArticulatedState(NamedTuple):
     lean: Tensor
     tilt: Tensor
     frame: int
-    waiting: Tensor | None
+    starts: Tensor | None
 
 
 class _Seen(NamedTuple):
@@ -181,6 +184,7 @@ class ArticulatedFilter(Estimator):
         self.chain = ArmChain(density, model.rate)
         rate = model.rate / self.every
         self.power = min(1.0, 1 / (rate * _SHARE_OF_TORSO))
+        self.starts = 1 + max(1, round(_BEGINNING * rate))
         self.grid = derived(owner, ("root grid", rate), (like,), lambda: RootGrid(rate, like))
         info, (self.neck_between, self.middle_alone) = model.prior.info, model.middle
         hand = model.hand or info.hand
@@ -210,10 +214,10 @@ class ArticulatedFilter(Estimator):
         sizes = self.lengths.sizes(lengths)
         middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
         lean = root.new_zeros(batch_size, 2)
-        waiting = torch.ones(batch_size, dtype=torch.bool, device=root.device)
+        starts = torch.full((batch_size,), self.starts, device=root.device)
         tilt = roll(lean_angle(lean))
         return ArticulatedState(
-            root, None, moments, lengths, sizes, None, middle, lean, tilt, 0, waiting
+            root, None, moments, lengths, sizes, None, middle, lean, tilt, 0, starts
         )
 
     def advance(
@@ -272,6 +276,10 @@ class ArticulatedFilter(Estimator):
         Args:
             state: the state before the frame. frame: its measurements. facts: what holds for them.
         """
+        due = state.roots is None or state.frame % self.every == 0
+        fresh, again = self._starting(state, frame) if due else (None, None)
+        if again is not None:
+            state = self._without_past(state, again)
         lean, tilt, sizes, moments = state.lean, state.tilt, state.sizes, state.moments
         if facts.leaning:
             joints = frame.rays[:, : len(UPPER_BODY)]
@@ -280,15 +288,14 @@ class ArticulatedFilter(Estimator):
         last = (state.middle[:, None] @ tilt)[:, 0]
         tilted = upright(frame, facts, tilt)
         # the torso: one hypothesis of the root, the mean of those near the likeliest
-        belief, roots, waiting = state.root, state.roots, state.waiting
-        if roots is None or state.frame % self.every == 0:
+        belief, roots, starts = state.root, state.roots, state.starts
+        if roots is None or due:
             power = torch.full_like(last[:, 0], 1.0 if roots is None else self.power)
-            fresh = None
-            if waiting is not None:
-                there = frame.limbs.flatten(1).any(1) & (frame.torso.sum(1) > 1)
-                fresh, waiting = _some(waiting & there), _some(waiting & ~there)
-                power = power if fresh is None else power.masked_fill(fresh, 1.0)
-            belief, roots = self.root.weigh(belief, tilted, last, sizes, power, fresh)
+            power = power if fresh is None else power.masked_fill(fresh, 1.0)
+            belief, roots, fits = self.root.weigh(belief, tilted, last, sizes, power, fresh)
+            if starts is not None and fresh is not None and fits is not None:
+                left = (starts - 1).masked_fill(fits, 0)
+                starts = _some(torch.where(fresh, left, starts))
             moments = self.grid.moments(belief)
         root = roots.mean
         middle = self.root.middle(tilted, root, last, sizes)
@@ -299,7 +306,7 @@ class ArticulatedFilter(Estimator):
         posterior = (
             self.chain.start(arms, hands)
             if state.arms is None
-            else self.chain.update(state.arms, arms, hands)
+            else self.chain.update(state.arms, arms, hands, again)
         )
         # the lengths of the bones, given both
         learnt = state.lengths
@@ -314,9 +321,33 @@ class ArticulatedFilter(Estimator):
         middle = (middle @ tilt.mT)[:, 0]
         after = ArticulatedState(
             belief, roots, moments, learnt, sizes, posterior, middle, lean, tilt, state.frame + 1,
-            waiting,
+            starts,
         )  # fmt: skip
         return _Step(after, seen, posterior)
+
+    def _starting(
+        self, state: ArticulatedState, frame: RayFrame
+    ) -> tuple[Bool[Tensor, " B"] | None, Bool[Tensor, " B"] | None]:
+        """Return which bodies start with this frame, and which of them start again; None is nobody."""
+        if state.starts is None:
+            return None, None
+        there = frame.limbs.flatten(1).any(1) & (frame.torso.sum(1) > 1)
+        fresh = there & (state.starts > 0)
+        return _some(fresh), _some(fresh & (state.starts < self.starts))
+
+    def _without_past(
+        self, state: ArticulatedState, chosen: Bool[Tensor, " B"]
+    ) -> ArticulatedState:
+        """Return the state in which torso and lengths of the chosen bodies are as before any frame."""
+        root = self.grid.init(len(chosen), self.lengths.size_spread)
+        moments = self.grid.moments(root)
+        lengths = self.lengths.init(len(chosen), moments.of_size)
+        begun = {
+            "root": root, "moments": moments, "lengths": lengths,
+            "sizes": self.lengths.sizes(lengths), "lean": torch.zeros_like(state.lean),
+        }  # fmt: skip
+        fields = {name: _where(chosen, new, getattr(state, name)) for name, new in begun.items()}
+        return state._replace(**fields)
 
     def _poses(self, found: Sequence[tuple[_Seen, ArmState]]) -> FramePose:
         """Return the estimates of T frames of all B sequences at once, [B T, ...]."""
@@ -352,8 +383,15 @@ class ArticulatedFilter(Estimator):
 
 
 def _some(chosen: Tensor) -> Tensor | None:
-    """Return the same; None if nobody is chosen."""
+    """Return the same; None if it is false or 0 for everybody."""
     return chosen if bool(chosen.any()) else None
+
+
+def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:
+    """Return the values of the chosen from `new`, and the others' from `old`, tensors or tuples of them."""
+    if isinstance(old, Tensor):
+        return torch.where(chosen.view(-1, *[1] * (old.ndim - 1)), new, old)
+    return type(old)(*(_where(chosen, *both) for both in zip(new, old, strict=True)))
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

@@ -23,6 +23,7 @@ from torchpose.upper_body._torso_likelihood import Root, middle_of_shoulders
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
 _SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones
+_MISFIT = 3.0  # nats for each measured joint and each arm below which a frame fits nobody
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
 
 
@@ -51,6 +52,7 @@ class _Weighed(NamedTuple):
         middle, shoulders: the middle of the shoulders, [B, M, 3], and their places, [B, 2, M, 3].
         arms: the hypotheses about both arms.
         evidence: the log-evidence of both together, [B, M]. of_each: that of each by itself, [B, 2, M].
+        variance: the variance across the rays of elbow and hand, metres squared, [B, 2, M, 2].
     """
 
     middle: Tensor
@@ -58,6 +60,7 @@ class _Weighed(NamedTuple):
     arms: Arms
     evidence: Tensor
     of_each: Tensor
+    variance: Tensor
 
 
 class RootStep(NamedTuple):
@@ -80,15 +83,15 @@ class RootStep(NamedTuple):
         sizes: Sizes,
         power: Float[Tensor, " B"],
         fresh: Bool[Tensor, " B"] | None,
-    ) -> tuple[Float[Tensor, "B S Z P"], Roots]:
-        """Return the posterior over the grid and the likeliest hypotheses.
+    ) -> tuple[Float[Tensor, "B S Z P"], Roots, Bool[Tensor, " B"] | None]:
+        """Return the posterior over the grid, the likeliest hypotheses, and whether arms that are fresh fit.
 
         Args:
             belief: the belief at the last update. frame: the measurements, in tilted axes.
             last: the middle of the shoulders in the frame before, in the same axes, [B, 3].
             sizes: the lengths of the bones. power: the exponent of the likelihood.
-            fresh: whose arms are seen for the first time with a torso, so that the depths at which they
-                cannot be are ruled out before the likeliest hypotheses are picked; None is nobody.
+            fresh: whose body starts with this frame, so that the depths at which its arms cannot be are
+                ruled out before the likeliest hypotheses are picked; None is nobody.
         """
         likelihood = self.grid.likelihood(frame.torso, sizes.torso, power)
         believed = self.grid.predict(belief) * likelihood
@@ -103,7 +106,8 @@ class RootStep(NamedTuple):
             against = torch.where(fresh[:, None, None], against, 0.0)
             believed = believed * against.exp()[:, None]
         root = self.grid.best(believed, _ROOTS)
-        middle, shoulders, arms, evidence, _ = self._weighed(frame, root, last, sizes)
+        middle, shoulders, arms, evidence, _, variance = self._weighed(frame, root, last, sizes)
+        fits = None if fresh is None else _fits(frame, root, evidence, variance)
         evidence = power[:, None] * evidence
         if fresh is not None:  # in place of what was said against them
             evidence = evidence - against.flatten(1).gather(1, root.cell)
@@ -111,7 +115,7 @@ class RootStep(NamedTuple):
         root = root._replace(log_weight=root.log_weight + evidence)
         near = _shares_of_mode(root)
         mean = _mean_of(root, near)
-        return belief, Roots(root, near, mean, middle, shoulders, arms.mean_directions)
+        return belief, Roots(root, near, mean, middle, shoulders, arms.mean_directions), fits
 
     def _weighed(
         self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
@@ -119,10 +123,11 @@ class RootStep(NamedTuple):
         """Return the arms given each hypothesis of the root, and their log-evidence."""
         middle = self.middle(frame, root, last, sizes)
         shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
-        arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
+        arm = _arm_input(frame, root, shoulders, sizes.metres, sizes.slack)
+        arms = self._coarse(arm)
         area = 2 * frame.given.limbs.sum(2)[..., None] * root.depth.log()[:, None]
         both = self.chain.evidence_of_both(arms) + area.sum(1)
-        return _Weighed(middle, shoulders, arms, both, arms.log_evidence + area)
+        return _Weighed(middle, shoulders, arms, both, arms.log_evidence + area, arm.variance)
 
     def middle(
         self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
@@ -206,6 +211,31 @@ def _arm_input(
         shoulder, middle, rays, given.limbs, frame.facts.patterns,
         noise[:, :, None] * depth.square() + loose, axes, bones, borders, given.log_inside,
     )  # fmt: skip
+
+
+def _fits(
+    frame: UprightFrame,
+    root: Root,
+    evidence: Float[Tensor, "B M"],
+    variance: Float[Tensor, "B 2 M 2"],
+) -> Bool[Tensor, " B"]:
+    """Return whether the arms fit any body.
+
+    Their log-evidence is taken relative to that of joints that are exactly where they are expected, with
+    the same noise:
+
+        log p(z) - sum_i log N(0; 0, R_i) > -3 (n_joints + n_arms)
+
+    Args:
+        frame: the measurements. root: the hypotheses. evidence: the log-evidence of the arms given each.
+        variance: the variance across the rays of elbow and hand, metres squared.
+    """
+    limbs = frame.given.limbs
+    peak = 2 * root.depth.log()[:, None, :, None] - (2 * math.pi * variance).log()
+    peak = torch.where(limbs[:, :, None], peak, 0.0).sum((1, 3))
+    share = torch.log_softmax(root.log_weight, 1)
+    relative = torch.logsumexp(share + evidence - peak, 1)
+    return relative > -_MISFIT * (limbs.sum((1, 2)) + limbs.any(2).sum(1))
 
 
 def _mean_of(root: Root, near: Float[Tensor, "B M"]) -> Root:

@@ -1,0 +1,106 @@
+"""Bodies start again where their first frame fits nobody."""
+
+import pytest
+import torch
+
+from tests.upper_body.test_articulated import ROW, body, pixels, tracker
+from torchpose.upper_body._root_grid import RootGrid
+
+SETTLED = 16  # frames: half a second
+
+
+def exchanged(uv, joint, count):
+    """Return keypoints of which those of both sides are exchanged in the first frames."""
+    rows = [ROW[f"{joint}_left"], ROW[f"{joint}_right"]]
+    uv = uv.clone()
+    uv[:count, rows] = uv[:count, rows[::-1]]
+    return uv
+
+
+def moved(uv, joint, by):
+    """Return keypoints of which one is elsewhere in the first frame, pixels."""
+    uv = uv.clone()
+    uv[0, ROW[joint]] += torch.tensor(by)
+    return uv
+
+
+BAD = {
+    "hands": lambda uv: exchanged(uv, "hand", 1),
+    "hands-of-three-frames": lambda uv: exchanged(uv, "hand", 3),
+    "elbows": lambda uv: exchanged(uv, "elbow", 1),
+    "shoulder-up": lambda uv: moved(uv, "shoulder_right", [0.0, -130.0]),
+}
+
+
+def spread_arms(n_frames=40):
+    """Return a body that waves with its hands apart."""
+    joints = body(n_frames)
+    joints[:, ROW["hand_left"], 0] += 0.06
+    joints[:, ROW["hand_right"], 0] -= 0.06
+    return joints
+
+
+def apart(found, wanted):
+    """Return the mean distance of joints relative to their necks, metres, after half a second."""
+    off = found - found[:, [ROW["neck"]]] - (wanted - wanted[:, [ROW["neck"]]])
+    return float(torch.linalg.vector_norm(off[SETTLED:], dim=-1).mean())
+
+
+@pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
+def test_a_bad_first_frame_is_forgotten(bad):
+    clean = pixels(spread_arms(), 2.0)
+    found, wanted = (tracker(outliers=False)(uv[None]).joints3d[0] for uv in (bad(clean), clean))
+    assert apart(found, wanted) < 0.03
+
+
+def test_a_stream_starts_again_as_the_whole_recording_does():
+    uv = BAD["hands"](pixels(spread_arms(12), 2.0))
+    whole, live = tracker()(uv[None]).joints3d, tracker()
+    state = live.init(1)
+    for t, frame in enumerate(uv):
+        state, pose = live.step(state, frame[None])
+        torch.testing.assert_close(pose.joints3d, whole[:, t], rtol=0, atol=1e-9)
+
+
+def test_others_of_a_batch_do_not_start_again():
+    clean = pixels(spread_arms(20), 2.0)
+    uv = torch.stack([clean, BAD["hands"](clean), BAD["shoulder-up"](clean)])
+    together = tracker()(uv).joints3d
+    for row, alone in enumerate(uv):
+        found = tracker()(alone[None]).joints3d[0]
+        torch.testing.assert_close(together[row], found, rtol=0, atol=1e-7)
+
+
+def test_smoothed_poses_forget_it_too():
+    clean = pixels(spread_arms(), 2.0)
+    smooth = tracker(smoothing="full")
+    found, wanted = (smooth(uv[None]).joints3d[0] for uv in (BAD["hands"](clean), clean))
+    assert apart(found, wanted) < 0.03
+
+
+@pytest.mark.parametrize("bad", [False, True], ids=["good", "bad"])
+def test_bodies_start_again_only_where_a_frame_does_not_fit(monkeypatch, bad):
+    looked, frame = [], 0
+    whole = RootGrid.at_all_depths
+
+    def look(*given):
+        looked.append(frame)
+        return whole(*given)
+
+    monkeypatch.setattr(RootGrid, "at_all_depths", look)
+    uv = pixels(spread_arms(24), 2.0)
+    live = tracker()
+    state = live.init(1)
+    for frame, keypoints in enumerate(BAD["hands"](uv) if bad else uv):  # noqa: B007  # `look` reads it
+        state, _ = live.step(state, keypoints[None])
+    assert looked[:2] == ([0, 3] if bad else [0])
+
+
+def test_bodies_that_never_fit_start_for_half_a_second(monkeypatch):
+    starts = []
+    whole = RootGrid.at_all_depths
+    monkeypatch.setattr(RootGrid, "at_all_depths", lambda *x: (starts.append(1), whole(*x))[1])
+    uv = exchanged(pixels(spread_arms(30), 2.0), "hand", 30)
+    found = tracker(outliers=False)(uv[None]).joints3d
+    assert len(starts) == 6
+    assert bool(found.isfinite().all())
