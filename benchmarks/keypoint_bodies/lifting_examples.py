@@ -42,11 +42,7 @@ _WIDER = {"hip": 2.0, "shoulder": 1.2}  # by which widths vary more than limbs
 _HIDDEN = (("knee", "ankle"), ("hip", "knee", "ankle"), ("elbow", "wrist"), ("wrist",))
 _LEGS = 2  # kinds of hidden joints, the first ones
 _SHARE_HIDDEN, _SHARE_AT_DESK = 0.25, 0.4  # of the pieces, and of those in which people sit
-_NEARER, _HIGHER, _CLEAR_OF_SEAT = (
-    1.0,
-    0.3,
-    1.3,
-)  # metres by which cameras may be, of people who sit
+_NEARER, _HIGHER, _CLEAR_OF_SEAT = 1.0, 0.3, 1.3  # metres, of cameras that see people who sit
 _ARMS_OF_OTHERS = 0.3  # share of the pieces
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
 _ARMS = [

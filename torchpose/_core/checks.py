@@ -87,9 +87,9 @@ def check_floating(name: str, tensor: Any) -> None:
         )
 
 
-def refuse_half(name: str, pixels: Tensor | None) -> None:
+def refuse_half(name: str, pixels: Tensor) -> None:
     """Raise `InputError` for pixels in half precision: above 512, bfloat16 has every fourth one alone."""
-    if pixels is not None and pixels.dtype in (torch.float16, torch.bfloat16):
+    if pixels.dtype in (torch.float16, torch.bfloat16):
         raise InputError(
             f"{name} must be torch.float32 or torch.float64, got {pixels.dtype}, which does not hold "
             "pixels; compute them with .float() in the network, outside autocast"

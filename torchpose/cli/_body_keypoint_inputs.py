@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli._track import is_video
+from torchpose.cli._track import OTHER_TABLES, is_video
 from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.skeleton._mediapipe_landmarks import count_given
 
@@ -19,19 +19,6 @@ if TYPE_CHECKING:
     from torchpose.video._source_interface import VideoSource
 
 _FPS = 30.0
-_DATA = (
-    ".npy",
-    ".json",
-    ".h5",
-    ".hdf5",
-    ".pkl",
-    ".pickle",
-    ".mat",
-    ".txt",
-    ".trc",
-    ".c3d",
-    ".parquet",
-)
 _DIFFERENT = 0.1  # share of frames by which inputs of one rate hardly differ
 _SAME_RATE = 3  # digits
 
@@ -116,7 +103,7 @@ def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
             or a detector without videos.
     """
     for path in map(Path, inputs):
-        if path.suffix.lower() in _DATA and path.exists():
+        if path.suffix.lower() in OTHER_TABLES and path.exists():
             raise FileFormatError(
                 f"{path}: expected keypoints of one camera as .npz, .csv or a folder of OpenPose JSON files, "
                 f"one per frame, got {path.suffix}"

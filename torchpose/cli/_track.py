@@ -34,10 +34,12 @@ torchpose track keypoints.npz --out result --method pf-mixture --n-particles 100
 torchpose track keypoints.npz --out result --print_config > track.yaml
 torchpose track --config track.yaml"""
 _JOINT_STDS = 5
-_NO_VIDEOS = (
-    ".npz", ".csv", ".json", ".txt", ".tsv", ".h5", ".hdf5", ".npy", ".pkl", ".pickle", ".mat", ".xlsx",
-    ".parquet",
+_KEYPOINT_FILES = (".npz", ".csv")
+OTHER_TABLES = (
+    ".json", ".txt", ".tsv", ".h5", ".hdf5", ".npy", ".pkl", ".pickle", ".mat", ".xlsx", ".parquet", ".trc",
+    ".c3d",
 )  # fmt: skip
+"""Ends of the names of tables that other programs write: neither videos, nor keypoints that are read."""
 PYTHON_ONLY = frozenset({
     "likelihood_power", "uniform_weight", "transition", "gamma", "subspace", "burn_in",
     "burn_in_scale", "weighting", "reset_below", "resample_threshold", "resampling", "start",
@@ -176,7 +178,7 @@ def is_video(where: str) -> bool:
     path = Path(where)
     if path.is_dir():
         return not any(path.glob("*.json"))
-    return path.suffix.lower() not in _NO_VIDEOS
+    return path.suffix.lower() not in (*_KEYPOINT_FILES, *OTHER_TABLES)
 
 
 def parse_stds(value: Any) -> float | list[float] | None:

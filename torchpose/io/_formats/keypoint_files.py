@@ -26,12 +26,8 @@ _SCORES = (*_TRUST, "score", "likelihood")  # names of it in tables
 FRAME_COLUMNS = ("frame", "frame_number", "frame_index", "frame_idx", "frame_id", "sync_index")
 """What the column of the frame is called, in small letters."""
 _NAMES = ("name", "keypoint", "landmark", "joint", "bodypart")
-_PASSED_OVER = (
-    "z",
-    "presence",
-)  # of keypoints, beside x and y; MediaPipe's depth is no measurement
+_PASSED_OVER = ("z", "presence")  # beside x and y; MediaPipe's depth is no measurement
 _TIMES = ("time", "timestamp", "timestamp_ms", "time_s", "frame_time")
-_LANDMARKS = 33  # of MediaPipe, which tables may number
 _DEEPLABCUT = {"scorer", "individuals", "bodyparts", "coords"}  # first cells of its header
 _OF_SEVERAL_CAMERAS = {"point_id", "img_loc_x", "img_loc_y"}
 _NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
@@ -223,7 +219,7 @@ def _long_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
 
 def _of_numbers(names: Sequence[str]) -> tuple[str, ...]:
     """Return names, those of MediaPipe's landmarks in place of their numbers."""
-    if len(names) == _LANDMARKS and set(names) == {str(i) for i in range(_LANDMARKS)}:
+    if sorted(names) == sorted(map(str, range(len(LANDMARKS)))):
         return tuple(LANDMARKS[int(name)] for name in names)
     return tuple(names)
 

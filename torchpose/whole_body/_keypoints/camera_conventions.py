@@ -27,9 +27,7 @@ _FRAMES = 12  # that are looked at, at most
 _LEAST_KEYPOINTS = 24  # in these frames, of joints that two cameras see
 _LEAST_BONES = 20  # in all images, that tell a size
 _SURE = 0.92  # agreement from which on nothing else is tried, unless the person is upside down
-_WELL_OF_TWO = (
-    0.9  # agreement of two cameras, which is easier, that another convention has to reach
-)
+_WELL_OF_TWO = 0.9  # in place of WELL where there are two cameras, which agree more easily
 _MOST_TRUNKS = 0.8  # share of images that show the trunk the same way
 _LITTLE = 0.02  # by how much cameras have to agree better on one who is not upside down
 _SIZES = (0.4, 1.6)  # of a person, by what is expected
