@@ -316,6 +316,18 @@ class Articulation(nn.Module):
         return JointJacobian(joints, jacobian)
 
 
+def covariances_of(
+    jacobian: Float[Tensor, "*batch J 3 N"], cov: Float[Tensor, "*batch N N"]
+) -> Float[Tensor, "*batch J 3 3"]:
+    """Return the covariances H_j P H_j^T of joints.
+
+    Args:
+        jacobian: H, of the joints by the tangent. cov: P, of the tangent.
+    """
+    moved = (jacobian.flatten(-3, -2) @ cov).unflatten(-2, (-1, 3))
+    return moved @ jacobian.mT
+
+
 class Mirror(NamedTuple):
     """Holds which column [R] of rotations the mirror image has in place of each, and its sign [R]."""
 

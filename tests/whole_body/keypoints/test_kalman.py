@@ -21,7 +21,6 @@ from torchpose.errors import (
 )
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body import BodyTrack, BodyTracker
-from torchpose.whole_body._keypoints import body_smoothing, keypoint_tracker
 from torchpose.whole_body._keypoints.keypoint_notes import (
     TOO_FEW,
     late_note,
@@ -617,19 +616,3 @@ def test_a_keypoint_that_is_of_no_ray_is_missing():
     frame = tracker(camera).by_keypoints.reader.frames(keypoints, None, None, None)
     assert (frame.inlier[0, 0] > 0).tolist() == [j != 3 for j in range(15)]
     assert bool(frame.pixels.isfinite().all())
-
-
-def test_smoothing_in_parts_is_that_of_all_frames(monkeypatch):
-    """Gains and Jacobians of some frames at a time give the same numbers, in less memory."""
-    seen = scene(3, n_frames=25)
-
-    def smoothed():
-        tracker = BodyTracker(seen.rig, "kalman", fps=FPS)
-        return tracker(keypoints=seen.keypoints, names=NAMES, smoothing="full")
-
-    whole = smoothed()
-    for module in (body_smoothing, keypoint_tracker):
-        monkeypatch.setattr(module, "CHUNK", 7)
-    parts = smoothed()
-    torch.testing.assert_close(parts.joints3d, whole.joints3d, rtol=0, atol=1e-12)
-    torch.testing.assert_close(parts.covariance3d, whole.covariance3d, rtol=0, atol=1e-12)

@@ -1,6 +1,6 @@
 """Smooth filtered body states backwards over time, after Rauch, Tung and Striebel."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -9,14 +9,12 @@ from torch import Tensor
 
 from torchpose.body._articulation import BodyPoint
 from torchpose.math._gaussian import safe_cholesky
-from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
-
-CHUNK = 256
-"""Frames of which gains or Jacobians are computed at once; those of all would take most of the memory."""
+from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
+from torchpose.whole_body._keypoints.nested import PART, mapped, part_of, stacked
 
 
-class SmoothedBodies(NamedTuple):
-    """Holds smoothed points [T, B] and their covariances [T, B, N, N]."""
+class BodyMoments(NamedTuple):
+    """Holds points [B, T] and their covariances [B, T, N, N]."""
 
     mean: BodyPoint
     cov: Tensor
@@ -24,56 +22,74 @@ class SmoothedBodies(NamedTuple):
 
 def smooth(
     filter: BodyKalmanFilter,
-    states: Sequence[BodyGaussian],
-    widened: Float[Tensor, "T B N"],
-    started: Bool[Tensor, "T B"],
-) -> SmoothedBodies:
-    """Return the smoothed states of whole sequences.
+    filtered: BodyMoments,
+    widened: Float[Tensor, "B T N"],
+    started: Bool[Tensor, "B T"],
+) -> Iterator[tuple[slice, BodyMoments]]:
+    """Yield which frames were smoothed, and their states, for parts of sequences from the last frame on.
 
     x_t|T = x_t + C (x_t+1|T - x_t+1|t),   P_t|T = P_t + C (P_t+1|T - P_t+1|t) C^T,   C = P_t F^T P_t+1|t^-1,
 
     with differences in tangent spaces. The pose prior is a measurement of its frame, which the filtered
-    state has; the prediction is without it.
+    state has; the prediction is without it. The filtered states of frames that were yielded may be written
+    over, so that the states of a long recording are held once.
 
     Args:
-        filter: that filtered. states: posteriors of T frames. widened: variances added to the predictions.
+        filter: that filtered. filtered: posteriors of T frames. widened: variances added to the predictions.
         started: frames in which tracking began anew, which say nothing of the frames before.
     """
-    points, covs = [states[-1].mean], [states[-1].cov]
-    for end in range(len(states) - 1, 0, -CHUNK):
-        rows = slice(max(0, end - CHUNK), end)
-        after = slice(rows.start + 1, end + 1)
-        mean, cov, ahead, predicted, gains = _gains(
-            filter, states[rows], widened[after], started[after]
+    last = filtered.cov.shape[1] - 1
+    after: BodyMoments = mapped(lambda value: value[:, last].clone(), filtered)
+    yield slice(last, last + 1), mapped(lambda value: value[:, None], after)
+    for end in range(last, 0, -PART):
+        rows = slice(max(0, end - PART), end)
+        later = slice(rows.start + 1, end + 1)
+        part = _smoothed(
+            filter, part_of(filtered, rows), after, widened[:, later], started[:, later]
         )
-        for t in range(len(cov) - 1, -1, -1):
-            off = filter.articulation.difference(points[-1], ahead.map(lambda value: value[t]))  # noqa: B023
-            step = (gains[t] @ off[..., None]).squeeze(-1)
-            points.append(filter.articulation.moved(mean.map(lambda value: value[t]), step))  # noqa: B023
-            change = gains[t] @ (covs[-1] - predicted[t]) @ gains[t].mT
-            covs.append(cov[t] + (change + change.mT) / 2)
-    points.reverse()
-    covs.reverse()
-    stacked = BodyPoint(*(torch.stack(v) for v in zip(*points, strict=True)))
-    return SmoothedBodies(stacked, torch.stack(covs))
+        yield rows, part
+        after = mapped(lambda value: value[:, 0].clone(), part)
+
+
+def _smoothed(
+    filter: BodyKalmanFilter,
+    filtered: BodyMoments,
+    after: BodyMoments,
+    widened: Float[Tensor, "B T N"],
+    started: Bool[Tensor, "B T"],
+) -> BodyMoments:
+    """Return the smoothed states of some frames.
+
+    Args:
+        filter: that filtered. filtered: posteriors. after: [B], smoothed, of the frame after the last one.
+        widened, started: of the frames after each of these.
+    """
+    body, found = filter.articulation, [after]
+    ahead, predicted, gains = _gains(filter, filtered, widened, started)
+    for t in range(predicted.shape[1] - 1, -1, -1):
+        (mean, cov), expected = mapped(lambda value: value[:, t], (filtered, ahead))  # noqa: B023
+        off = body.difference(found[-1].mean, expected)
+        step = (gains[:, t] @ off[..., None]).squeeze(-1)
+        change = gains[:, t] @ (found[-1].cov - predicted[:, t]) @ gains[:, t].mT
+        found.append(BodyMoments(body.moved(mean, step), cov + (change + change.mT) / 2))
+    smoothed: BodyMoments = stacked(found[:0:-1])
+    return smoothed
 
 
 def _gains(
     filter: BodyKalmanFilter,
-    states: Sequence[BodyGaussian],
-    widened: Float[Tensor, "T B N"],
-    started: Bool[Tensor, "T B"],
-) -> tuple[BodyPoint, Tensor, BodyPoint, Tensor, Tensor]:
-    """Return means and covariances of some frames, those predicted for the frames after them, and C.
+    filtered: BodyMoments,
+    widened: Float[Tensor, "B T N"],
+    started: Bool[Tensor, "B T"],
+) -> tuple[BodyPoint, Tensor, Tensor]:
+    """Return means and covariances predicted for the frames after some, and C.
 
     Args:
-        filter: that filtered. states: posteriors. widened, started: of the frames after these.
+        filter: that filtered. filtered: posteriors. widened, started: of the frames after these.
     """
     model, body = filter.transition, filter.articulation
-    mean = BodyPoint(*(torch.stack(v) for v in zip(*(s.mean for s in states), strict=True)))
-    cov = torch.stack([s.cov for s in states])
-    ahead = body.moved(mean, model.step(body, mean))
-    carried = model.matrix @ cov
+    ahead = body.moved(filtered.mean, model.step(body, filtered.mean))
+    carried = model.matrix @ filtered.cov
     predicted = carried @ model.matrix.mT + model.noise + torch.diag_embed(widened)
     gains = torch.cholesky_solve(carried, safe_cholesky(predicted)).mT
-    return mean, cov, ahead, predicted, gains * ~started[..., None, None]
+    return ahead, predicted, gains * ~started[..., None, None]

@@ -1,7 +1,5 @@
 """Track the feet of bodies that are tracked: frame by frame, or whole sequences, filtered or smoothed."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -15,8 +13,7 @@ from torchpose.whole_body._keypoints.foot_filter import (
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
-from torchpose.whole_body._keypoints.keypoint_tracker import stacked
-from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.nested import PART, FrameCollector, by_parts, mapped
 from torchpose.whole_body._keypoints.turned_cameras import is_turned, turned
 
 
@@ -66,50 +63,53 @@ def track_feet(
         filter: of feet. maps: of the cameras. poses: of the bodies [B, T], smoothed where feet are to be.
         frames: keypoints [B, T, C, 6]. smoothing: whether later frames count too.
     """
-    every = filter.legs(poses)
+    every = by_parts(filter.legs, poses)
     beliefs = exchanged_legs(poses.exchanged, poses.scale)
     frames = _as_bodies_saw(frames, poses, maps)
     state: FootGaussian | None = None
-    states, found = [], []
-    for t in range(poses.started.shape[1]):
+    n_frames = poses.started.shape[1]
+    found = FrameCollector(n_frames)
+    for t in range(n_frames):
         legs, frame, believed = mapped(lambda value: value[:, t], (every, frames, beliefs))  # noqa: B023
         state, feet = filter.advance(state, legs, frame, maps, believed, poses.started[:, t])
-        states.append(state)
-        found.append(feet)
-    filtered: FootPoses = stacked(found)
+        found.add((state, feet) if smoothing else feet)
     if not smoothing:
+        filtered: FootPoses = found.sequence
         return filtered
-    smoothed = smooth_feet(filter, states, poses.started.mT)
-    return filter.poses(smoothed, every, filtered.inlier)
+    states, filtered = found.sequence
+    smoothed = smooth_feet(filter, states, poses.started)
+    feet = by_parts(filter.poses, smoothed, every, filtered.inlier)
+    return feet
 
 
 def smooth_feet(
-    filter: FootFilter, states: Sequence[FootGaussian], started: Bool[Tensor, "T B"]
+    filter: FootFilter, states: FootGaussian, started: Bool[Tensor, "B T"]
 ) -> FootGaussian:
-    """Return Gaussians [B, T] of whole sequences, after Rauch, Tung and Striebel.
+    """Smooth Gaussians [B, T] of whole sequences in their place, after Rauch, Tung and Striebel.
 
     m_t|T = m_t + C (m_t+1|T - m_t+1|t),   P_t|T = P_t + C (P_t+1|T - P_t+1|t) C^T,   C = P_t F^T P_t+1|t^-1.
 
     Args:
-        filter: that filtered. states: posteriors of T frames.
+        filter: that filtered. states: posteriors of T frames, which are written over.
         started: frames in which tracking began anew, which say nothing of the frames before.
     """
     model = filter.motion
-    mean, cov, centre = (torch.stack(values) for values in zip(*states, strict=True))
-    carried = model.matrix @ cov[:-1]
-    predicted = carried @ model.matrix.mT + model.noise
-    gains = torch.cholesky_solve(carried, safe_cholesky(predicted)).mT
-    gains = gains * ~started[1:, :, None, None, None]
-    ahead = filter.carried(mean[:-1], centre[:-1], centre[1:])
-    means, covs = [mean[-1]], [cov[-1]]
-    for t in range(len(states) - 2, -1, -1):
-        step = (gains[t] @ (means[-1] - ahead[t])[..., None]).squeeze(-1)
-        means.append(mean[t] + step)
-        change = gains[t] @ (covs[-1] - predicted[t]) @ gains[t].mT
-        covs.append(cov[t] + (change + change.mT) / 2)
-    return FootGaussian(
-        torch.stack(means[::-1], 1), torch.stack(covs[::-1], 1), centre.transpose(0, 1)
-    )
+    mean, cov, centre = states
+    for end in range(mean.shape[1] - 1, 0, -PART):
+        begin = max(0, end - PART)
+        rows, later = slice(begin, end), slice(begin + 1, end + 1)
+        carried = model.matrix @ cov[:, rows]
+        predicted = carried @ model.matrix.mT + model.noise
+        gains = torch.cholesky_solve(carried, safe_cholesky(predicted)).mT
+        gains = gains * ~started[:, later, None, None, None]
+        ahead = filter.carried(mean[:, rows], centre[:, rows], centre[:, later])
+        for t in range(end - 1, begin - 1, -1):
+            C = gains[:, t - begin]
+            off = mean[:, t + 1] - ahead[:, t - begin]
+            mean[:, t] += (C @ off[..., None]).squeeze(-1)
+            change = C @ (cov[:, t + 1] - predicted[:, t - begin]) @ C.mT
+            cov[:, t] += (change + change.mT) / 2
+    return states
 
 
 def continued(

@@ -1,6 +1,5 @@
 """Track bodies through keypoints: begin, filter, begin anew where a person was lost, smooth."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
-from torchpose.body._articulation import BodyPoint
+from torchpose.body._articulation import covariances_of
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
@@ -18,7 +17,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_size import SizeBelief
-from torchpose.whole_body._keypoints.body_smoothing import CHUNK, smooth
+from torchpose.whole_body._keypoints.body_smoothing import BodyMoments, smooth
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
     CameraFaults,
@@ -50,7 +49,13 @@ from torchpose.whole_body._keypoints.lone_camera import (
     of_any_size,
     state_of,
 )
-from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.nested import (
+    FrameCollector,
+    mapped,
+    part_of,
+    taken,
+    write_part,
+)
 from torchpose.whole_body._keypoints.only_camera import OnlyCamera
 
 LEAST_JOINTS = 6  # that are measured where tracking begins
@@ -111,15 +116,12 @@ class KeypointTracker(nn.Module):
         """
         n_frames = frames.pixels.shape[1]
         stream: KeypointStream | None = None
-        poses, corrected = [], []
+        every = FrameCollector(n_frames)
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
             frame = frames.map(lambda value: value[:, t])  # noqa: B023
             stream, pose, found = self.advance(stream, frame, waited=waited, watch=watch)
-            poses.append(pose)
-            if smoothing:
-                corrected.append(found)
-        filtered = stacked(poses)
-        return self.smoothed(filtered, corrected) if smoothing else filtered
+            every.add(to_be_smoothed(pose, found) if smoothing else pose)
+        return self.smoothed(*every.sequence) if smoothing else every.sequence
 
     def advance(
         self,
@@ -435,44 +437,45 @@ class KeypointTracker(nn.Module):
 
     # --- whole sequences --------------------------------------------------------------------------
 
-    def smoothed(
-        self,
-        filtered: KeypointPoses,
-        corrected: Sequence[CorrectedBody],
-    ) -> KeypointPoses:
-        """Return poses for which later frames count too, up to where tracking began anew."""
-        widened = torch.stack([found.widened for found in corrected])
-        states = [found.state for found in corrected]
-        result = smooth(self.filter, states, widened, filtered.started.mT)
-        point = result.mean.map(lambda value: value.transpose(0, 1))
-        cov = result.cov.transpose(0, 1)
-        joints, joint_cov = self._joints(point, cov)
-        poses = filtered._replace(
+    def smoothed(self, filtered: KeypointPoses, widened: Float[Tensor, "B T N"]) -> KeypointPoses:
+        """Return poses for which later frames count too, up to where tracking began anew.
+
+        Args:
+            filtered: with states of `to_be_smoothed`, which are written over. widened: as there.
+        """
+        poses = filtered if self.only is None else self.only.as_last_told(filtered)
+        states = BodyMoments(poses.point, poses.state_cov)
+        for rows, part in smooth(self.filter, states, widened, poses.started):
+            write_part(_told(poses), rows, _told(self._as_smoothed(part_of(poses, rows), part)))
+        return poses
+
+    def _as_smoothed(self, poses: KeypointPoses, smoothed: BodyMoments) -> KeypointPoses:
+        """Return poses with the states, and joints, that were smoothed."""
+        point, cov = smoothed
+        joints, jacobian = self.filter.articulation.linearise(point)
+        joint_cov = covariances_of(jacobian, cov)
+        poses = poses._replace(
             joints=joints,
-            covariance=self._unsure(joint_cov, joints, filtered.alone),
+            covariance=self._unsure(joint_cov, joints, poses.alone),
             point=point,
             state_cov=cov,
             joint_cov=joint_cov,
         )
-        return poses if self.only is None else self.only.at_last_size(poses)
+        return poses if self.only is None else self.only.sized(poses)
 
-    def _joints(self, point: BodyPoint, cov: Tensor) -> tuple[Tensor, Tensor]:
-        """Return joints [B, T, J, 3] and covariances; Jacobians of all frames would fill the memory."""
-        parts = []
-        for begin in range(0, cov.shape[1], CHUNK):
-            rows = slice(begin, begin + CHUNK)
-            some = point.map(lambda value: value[:, rows])  # noqa: B023
-            joints, jacobian = self.filter.articulation.linearise(some)
-            parts.append((joints, (jacobian @ cov[:, rows].unsqueeze(-3)) @ jacobian.mT))
-        joints, joint_cov = (torch.cat(values, 1) for values in zip(*parts, strict=True))
-        return joints, joint_cov
+
+def to_be_smoothed(
+    pose: KeypointPoses, found: CorrectedBody
+) -> tuple[KeypointPoses, Float[Tensor, "B N"]]:
+    """Return the poses of a frame with the states as they were filtered, and by what these were widened."""
+    return pose._replace(point=found.state.mean, state_cov=found.state.cov), found.widened
+
+
+def _told(poses: KeypointPoses) -> tuple[Any, ...]:
+    """Return what smoothing changes."""
+    return poses.joints, poses.covariance, poses.point, poses.state_cov, poses.joint_cov
 
 
 def _sees_enough(there: Bool[Tensor, "B C J"]) -> Bool[Tensor, "B C"]:
     """Return which cameras see enough joints of a person for a start by themselves."""
     return there.sum(-1) >= LEAST_JOINTS
-
-
-def stacked(poses: Sequence[Any]) -> Any:
-    """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
-    return mapped(lambda *values: torch.stack(values, 1), *poses)

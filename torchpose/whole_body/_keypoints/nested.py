@@ -1,9 +1,13 @@
-"""Apply functions to all tensors of tuples, and of tuples in them."""
+"""Apply functions to all tensors of tuples, and of tuples in them; collect those of frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
+
+PART = 256
+"""Frames of a long recording that are worked on at once; what that needs for all would fill the memory."""
 
 
 def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
@@ -22,3 +26,66 @@ def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
 def taken(value: Any, index: Tensor) -> Any:
     """Return some elements of the batch, of a tensor or of named tuples of tensors."""
     return mapped(lambda tensor: tensor[index], value)
+
+
+def stacked(frames: Sequence[Any]) -> Any:
+    """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
+    return mapped(lambda *values: torch.stack(values, 1), *frames)
+
+
+def part_of(value: Any, rows: slice, dim: int = 1) -> Any:
+    """Return the frames from the start of a slice to its stop, of tensors or of named tuples of tensors."""
+    return mapped(lambda tensor: tensor.narrow(dim, rows.start, rows.stop - rows.start), value)
+
+
+def write_part(value: Any, rows: slice, part: Any) -> None:
+    """Write over some frames of tensors [B, T, ...], or of tuples of them."""
+    mapped(lambda every, some: every[:, rows].copy_(some), value, part)
+
+
+def by_parts(fn: Callable[..., Any], *sequences: Any, dim: int = 1) -> Any:
+    """Return what a function makes of sequences, computed for some frames at a time.
+
+    Args:
+        fn: of as many tensors, or tuples of them, as there are sequences; it returns one of the same frames.
+        sequences: tensors, or tuples of them. dim: of the frames, in all tensors.
+    """
+    end = _n_frames(sequences, dim)
+    parts = [slice(begin, min(begin + PART, end)) for begin in range(0, end, PART)]
+    found = [fn(*part_of(sequences, rows, dim)) for rows in parts]
+    return found[0] if len(found) == 1 else mapped(lambda *values: torch.cat(values, dim), *found)
+
+
+def _n_frames(value: Any, dim: int) -> int:
+    return _n_frames(value[0], dim) if isinstance(value, tuple) else value.shape[dim]
+
+
+class FrameCollector:
+    """Collects the named tuples of T frames, tensors [B, ...], as one of tensors [B, T, ...] held once.
+
+    Args:
+        n_frames: T.
+
+    Attributes:
+        sequence: what was collected; it has all frames after the last one was added.
+    """
+
+    def __init__(self, n_frames: int) -> None:
+        self.sequence: Any = None
+        self._n_frames, self._count = n_frames, 0
+        self._some: list[Any] = []
+
+    def add(self, frame: Any) -> None:
+        """Add the next frame."""
+        self._some.append(frame)
+        done = self._count + len(self._some)
+        if len(self._some) < PART and done < self._n_frames:
+            return
+        part, rows = stacked(self._some), slice(self._count, done)
+        if self.sequence is None:
+            self.sequence = mapped(self._for_all, part)
+        write_part(self.sequence, rows, part)
+        self._some, self._count = [], done
+
+    def _for_all(self, part: Tensor) -> Tensor:
+        return part.new_empty(len(part), self._n_frames, *part.shape[2:])

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.body._articulation import covariances_of
 from torchpose.body._feet import ANKLES
 from torchpose.body._skeleton import BODY_15
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
@@ -29,7 +30,7 @@ from torchpose.whole_body._keypoints.body_size import (
     units_of_size,
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStep
-from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.nested import by_parts, mapped
 
 # On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
 # strangers to a network that was fitted without them.
@@ -67,11 +68,14 @@ class OnlyCamera:
             stream, pose = stream._replace(size=size), pose._replace(size=size)
         return stream, self.sized(pose), found
 
-    def at_last_size(self, poses: KeypointPoses) -> KeypointPoses:
-        """Return sequences [B, T] at the sizes that are believed after their last frames."""
+    def as_last_told(self, poses: KeypointPoses) -> KeypointPoses:
+        """Return sequences [B, T] with the sizes that are believed after their last frames, to be `sized`.
+
+        How long joints have not been seen is told by later frames as well.
+        """
         last = mapped(lambda value: value[:, -1:].expand_as(value), poses.size)
         unseen = torch.minimum(poses.unseen, until_seen(poses.unseen) / self.filter.fps)
-        return self.sized(poses._replace(size=last, unseen=unseen))
+        return poses._replace(size=last, unseen=unseen)
 
     def sized(self, poses: KeypointPoses) -> KeypointPoses:
         """Return poses, as the filter has them, at the sizes that are stated with them."""
@@ -95,13 +99,21 @@ class OnlyCamera:
             covariance=poses.joint_cov + lasting + of_size + unsure,
         )
 
-    def covariance_from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "*batch J 3 3"]:
-        """Return the covariances of joints relative to the pelvis, whose own is zero; metres squared."""
+    def covariance_from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
+        """Return the covariances of joints relative to the pelvis, whose own is zero; metres squared.
+
+        Args:
+            poses: of T frames, [T].
+        """
+        return by_parts(self._from_pelvis, poses, dim=0)
+
+    def _from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
+        """Return `covariance_from_pelvis` of some frames."""
         _, jacobian = self.filter.articulation.linearise(poses.point)
         apart = jacobian - jacobian[..., [_PELVIS], :, :]
         lasting = self._unsure(poses, _guessed_from_pelvis(poses))
         lasting[..., _PELVIS, :, :] = 0
-        return apart @ poses.state_cov.unsqueeze(-3) @ apart.mT + lasting
+        return covariances_of(apart, poses.state_cov) + lasting
 
     def _unsure(
         self, poses: KeypointPoses, variances: Float[Tensor, "*batch J"]

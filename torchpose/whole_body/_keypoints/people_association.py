@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.body._articulation import covariances_of
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
@@ -51,7 +52,7 @@ def detection_gains(
         frame: [D, C, J], of the D detections of each camera. width: factor of the noise's variance.
     """
     joints, jacobian = filter.articulation.linearise(predicted.mean)
-    joint_cov = (jacobian @ predicted.cov.unsqueeze(-3)) @ jacobian.mT
+    joint_cov = covariances_of(jacobian, predicted.cov)
     seen = see(filter.maps, joints)
     n_persons, n_detections = len(joints), len(frame.pixels)
     persons = torch.arange(n_persons, device=joints.device).repeat_interleave(n_detections)

@@ -24,8 +24,8 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
-from torchpose.whole_body._keypoints.keypoint_tracker import stacked
-from torchpose.whole_body._keypoints.nested import taken
+from torchpose.whole_body._keypoints.keypoint_tracker import to_be_smoothed
+from torchpose.whole_body._keypoints.nested import FrameCollector, stacked, taken
 from torchpose.whole_body._keypoints.people_association import (
     pairs_of_detections,
     taken_detections,
@@ -209,15 +209,19 @@ class PeopleBodyTracker:
         self, rows: Sequence[_Row], person: int, feet: KeypointFrame | None, smoothing: bool
     ) -> BodyTrack:
         """Return the track of one person with the feet, of detections [T, D, C, 6]."""
-        found = [taken(row.frame, torch.tensor([row.row])) for row in rows]
-        poses: KeypointPoses = stacked([one.poses for one in found])
-        if smoothing:
-            poses = self.single.tracker.smoothed(poses, [one.corrected for one in found])
+        every = FrameCollector(len(rows))
+        for row in rows:
+            one, pose = torch.tensor([row.row]), row.frame.poses
+            every.add(taken(to_be_smoothed(pose, row.frame.corrected) if smoothing else pose, one))
+        poses = self.single.tracker.smoothed(*every.sequence) if smoothing else every.sequence
         standing = None
         if feet is not None:
             seen = [
-                taken_detections(feet.map(lambda value: value[row.time]), one.detection)  # noqa: B023
-                for row, one in zip(rows, found, strict=True)
+                taken_detections(
+                    feet.map(lambda value: value[row.time]),  # noqa: B023
+                    row.frame.detection[[row.row]],
+                )
+                for row in rows
             ]
             standing = self.single.feet_of(poses, stacked(seen), smoothing)
         return self._track_of(rows, person, standing, poses)
@@ -231,13 +235,14 @@ class PeopleBodyTracker:
         summed_up: bool = True,
     ) -> BodyTrack:
         """Return the track of one person; by default of the poses as they were filtered."""
-        found = [taken(row.frame, torch.tensor([row.row])) for row in rows]
-        poses = stacked([one.poses for one in found]) if poses is None else poses
-        keypoints: KeypointFrame = stacked([one.keypoints for one in found])
+        found = [(row.frame, torch.tensor([row.row])) for row in rows]
+        if poses is None:
+            poses = stacked([taken(frame.poses, one) for frame, one in found])
+        keypoints: KeypointFrame = stacked([taken(frame.keypoints, one) for frame, one in found])
         track = self.single.builder.track(
             poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet
         )
-        track.details["detection"] = torch.cat([one.detection for one in found])
+        track.details["detection"] = torch.cat([frame.detection[one] for frame, one in found])
         track.details["person"] = track.details["detection"].new_full((len(rows),), person)
         return track
 
