@@ -97,7 +97,17 @@ def members(cls: type) -> Iterator[Documented]:
             overridden = [vars(base)[name] for base in ours(cls) if name in vars(base)]
             docs = [doc for one in overridden if (doc := (function_of(one) or one).__doc__)]
             label = f"{function.__module__}.{function.__qualname__}"
-            yield Documented(label, kind, inspect.cleandoc(docs[0]) if docs else "", node)
+            yield Documented(label, kind, with_inherited([inspect.cleandoc(d) for d in docs]), node)
+
+
+def with_inherited(docs: list[str]) -> str:
+    """Return the first of some docstrings, with the sections that it lacks and methods it overrides have."""
+    doc = docs[0] if docs else ""
+    for below in docs[1:]:
+        for kind, text in sections(below).items():
+            if kind not in sections(doc):
+                doc += f"\n\n{kind}:\n{textwrap.indent(text, '    ')}"
+    return doc
 
 
 def ours(cls: type) -> list[type]:

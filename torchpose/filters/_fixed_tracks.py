@@ -130,17 +130,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Filter one frame, given its checked measurements (BL 34-41, 49).
-
-        Args:
-            state: the state of the B sequences, from `init` or the frame before.
-            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return the covariance as well.
-
-        Returns:
-            The next state, and a `StepOutput` with the mean [B, D].
-        """
+        """Filter one frame, given its checked measurements (BL 34-41, 49)."""
         rule, way = self.weight_rule, self._way
         if way == "traced":
             return self._filter_unseen(rule, state, frame, return_cov)
@@ -186,16 +176,6 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
         The plain recursion is left to gradients of model or noise, and to burn-in where all sequences
         share their gains.
-
-        Args:
-            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
-                [B].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return covariances as well.
-            progress: whether to show a progress bar.
-
-        Returns:
-            `FilterOutput` with means [B, T, D].
         """
         if self._way != "tracked":
             return super().filter_frames(frames, generator, return_cov, progress)
@@ -227,19 +207,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         return_cov: bool,
         progress: bool = False,
     ) -> tuple[MKFState, FilterOutput]:
-        """Filter some more frames, given checked measurements; all at once if the filter has no memory.
-
-        Args:
-            state: the state of the B sequences, from `init` or the frames before.
-            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
-                [B].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return covariances as well.
-            progress: whether to show a progress bar.
-
-        Returns:
-            The next state, and a `FilterOutput` with means [B, T, D].
-        """
+        """Filter some more frames, given checked measurements; all at once if the filter has no memory."""
         if self._way != "alone":
             return super().continue_frames(state, frames, generator, return_cov, progress)
         rule, n_frames = self.weight_rule, frames.z.shape[1]

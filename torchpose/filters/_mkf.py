@@ -274,32 +274,13 @@ class MixtureKalmanFilter(RecursiveFilter):
         )
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Check that a state is one of this filter's, for a batch of this size.
-
-        Args:
-            state: as a step would take it.
-            batch: B, number of sequences.
-
-        Raises:
-            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
-                of other sizes.
-        """
+        """Check that a state is one of this filter's, for a batch of this size."""
         require_state(state, MKFState, "mean", (batch, self.n_tracks, self.dim))
 
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Filter one frame, given its checked measurements; implemented for each kind of tracks.
-
-        Args:
-            state: the state of the B sequences, from `init` or the frame before.
-            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return the covariance as well.
-
-        Returns:
-            The next state, and a `StepOutput` with the mean [B, D].
-        """
+        """Filter one frame, given its checked measurements; implemented for each kind of tracks."""
         raise NotImplementedError(f"{type(self).__name__} has no tracks")
 
     def extra_repr(self) -> str:

@@ -246,16 +246,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         return self._evenly(white, 0)
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Check that a state is one of this filter's, for a batch of this size.
-
-        Args:
-            state: as a step would take it.
-            batch: B, number of sequences.
-
-        Raises:
-            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
-                of other sizes.
-        """
+        """Check that a state is one of this filter's, for a batch of this size."""
         require_state(state, ParticleState, "white", (batch, self.n_particles, self.dim))
 
     def _draw(
@@ -312,17 +303,7 @@ class BootstrapParticleFilter(RecursiveFilter):
     def filter_frame(
         self, state: ParticleState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[ParticleState, StepOutput]:
-        """Filter one frame: resample if due, propose, weigh (BL 14, 23-26).
-
-        Args:
-            state: the state of the B sequences, from `init` or the frame before.
-            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return the covariance as well.
-
-        Returns:
-            The next state, and a `StepOutput` with the mean [B, D].
-        """
+        """Filter one frame: resample if due, propose, weigh (BL 14, 23-26)."""
         if state.time == 0 and self.start == "measured":
             white, evidence, work = self._draw_measured(frame, generator)
             return self._output(self._evenly(white, 1), evidence, frame.mask, return_cov, work)

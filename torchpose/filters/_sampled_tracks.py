@@ -102,17 +102,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Filter one frame: draw indicators, filter, weigh (BL 47), and resample if needed (BL 25).
-
-        Args:
-            state: the state of the B sequences, from `init` or the frame before.
-            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return the covariance as well.
-
-        Returns:
-            The next state, and a `StepOutput` with the mean [B, D].
-        """
+        """Filter one frame: draw indicators, filter, weigh (BL 47), and resample if needed (BL 25)."""
         drawn = self._draw_components(frame.z.shape[0], generator)
         matrix, offset, noise = (part[drawn] for part in self.transition(state.time))
         wide = torch.float64
@@ -138,18 +128,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     def filter_frames(
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
     ) -> FilterOutput:
-        """Filter whole sequences, given checked measurements, some sequences at a time.
-
-        Args:
-            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
-                [B].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return covariances as well.
-            progress: whether to show a progress bar.
-
-        Returns:
-            `FilterOutput` with means [B, T, D].
-        """
+        """Filter whole sequences, given checked measurements, some sequences at a time."""
         if not values_visible() or wants_gradient(frames.z, frames.cov, *self.sources):
             return super().filter_frames(frames, generator, return_cov, progress)
         batch, n_frames = frames.z.shape[:2]

@@ -97,16 +97,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         )  # fmt: skip
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Check that a state is one of this filter's, for a batch of this size.
-
-        Args:
-            state: as a step would take it.
-            batch: B, number of sequences.
-
-        Raises:
-            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
-                of other sizes.
-        """
+        """Check that a state is one of this filter's, for a batch of this size."""
         # Any number of tracks: before the first frame there is one for each component.
         require_state(state, MKFState, "mean", (batch, None, self.dim))
 
@@ -116,15 +107,6 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         """Filter one frame: continue each of the M tracks by each of the K components, keep the M likeliest.
 
         Only the measured block of the M K predicted covariances is formed before the selection.
-
-        Args:
-            state: the state of the B sequences, from `init` or the frame before.
-            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return the covariance as well.
-
-        Returns:
-            The next state, and a `StepOutput` with the mean [B, D].
         """
         if self._in_place(frame):
             return self._filter_in_place(state, frame, return_cov)
@@ -146,18 +128,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
     def filter_frames(
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
     ) -> FilterOutput:
-        """Filter whole sequences, given checked measurements, some sequences at a time.
-
-        Args:
-            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
-                [B].
-            generator: for filters that draw; one generator, or a list of one for each sequence.
-            return_cov: whether to return covariances as well.
-            progress: whether to show a progress bar.
-
-        Returns:
-            `FilterOutput` with means [B, T, D].
-        """
+        """Filter whole sequences, given checked measurements, some sequences at a time."""
         if not self._in_place(frames):
             return super().filter_frames(frames, generator, return_cov, progress)
         batch, n_frames = frames.z.shape[:2]

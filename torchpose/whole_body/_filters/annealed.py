@@ -157,29 +157,13 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
 
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
-        """Return the number of likelihoods that one particle costs in a frame: the number of layers.
-
-        Args:
-            options: the options of the filter, as given to it.
-
-        Returns:
-            Number of likelihoods for each particle and frame.
-        """
+        """Return the number of likelihoods that one particle costs in a frame: the number of layers."""
         return options.get("n_layers", _LAYERS)
 
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Anneal from the resampled particles of the last frame.
-
-        Args:
-            state: the state of the last frame, with resampled particles and the filter's memory of them.
-            frame: the observation of the frame.
-            generator: one generator, or a list of one for each element.
-
-        Returns:
-            `WeightedParticles` [B, N, D] of the next frame.
-        """
+        """Anneal from the resampled particles of the last frame."""
         run = self.anneal(state.particles, frame.score, frame.seen, generator)
         no_evidence = torch.full_like(run.log_weights[:, 0], torch.nan)
         return WeightedParticles(run.particles, run.log_weights, no_evidence)

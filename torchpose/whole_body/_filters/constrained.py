@@ -182,16 +182,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Predict within the action (AS 3, 6), then weigh by the image (AS 7).
-
-        Args:
-            state: the state of the last frame, with resampled particles and the filter's memory of them.
-            frame: the observation of the frame.
-            generator: one generator, or a list of one for each element.
-
-        Returns:
-            `WeightedParticles` [B, N, D] of the next frame.
-        """
+        """Predict within the action (AS 3, 6), then weigh by the image (AS 7)."""
         trend = self._trend(state)
         batch, n, dim = state.particles.shape
         rows = Rows.all(batch, n, generator, state.particles.device)
@@ -227,14 +218,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return () if self.gate is None or not self.gate.several else tuple(self.gate.action.names)
 
     def notes(self, track: BodyFilterOutput, first_frame: int = 0) -> tuple[str, ...]:
-        """Report the share of draws that the gate accepted, and when it was released.
-
-        Args:
-            track: the track of one sequence, [T, ...]. first_frame: number of its first frame.
-
-        Returns:
-            Sentences, none if there is nothing to report.
-        """
+        """Report the share of draws that the gate accepted, and when it was released."""
         if self.gate is None:
             return ()
         accepted, clamped = track.details["acceptance"], track.details["clamped"]
@@ -259,14 +243,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
 
     @classmethod
     def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
-        """Return the options of tracking: twice the error of a constant velocity, the published likelihood.
-
-        Args:
-            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
-
-        Returns:
-            Keyword arguments of the filter.
-        """
+        """Return the options of tracking: twice the error of constant velocity, the published likelihood."""
         step = torch.empty(body.dim, dtype=torch.float64)
         step[:3], step[3:6], step[6:] = _TRACKING_STD
         return {

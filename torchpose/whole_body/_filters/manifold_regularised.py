@@ -121,14 +121,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     def tracking_options(
         cls, body: Any, fps: float, learnt: PoseManifold | None = None
     ) -> dict[str, Any]:
-        """Return the options of tracking: the usual ones, with twice the noise of the manifold.
-
-        Args:
-            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
-
-        Returns:
-            Keyword arguments of the filter.
-        """
+        """Return the options of tracking: the usual ones, with twice the noise of the manifold."""
         options = super().tracking_options(body, fps)
         if learnt is not None:
             options["process_cov"] = _process_cov(body, learnt, fps, _TRACKING_STEP)
@@ -137,16 +130,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Take steps 3 to 7 of Algorithm 1: draw targets, propose, weigh by the manifold and the image.
-
-        Args:
-            state: the state of the last frame, with resampled particles and the filter's memory of them.
-            frame: the observation of the frame.
-            generator: one generator, or a list of one for each element.
-
-        Returns:
-            `WeightedParticles` [B, N, D] of the next frame.
-        """
+        """Take steps 3 to 7 of Algorithm 1: draw targets, propose, weigh by the manifold and the image."""
         particles, seen = state.particles, frame.seen
         before = particles.index_select(-1, self.columns)
         target = self.draw_targets(before, generator)

@@ -167,26 +167,12 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
 
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
-        """Return the number of likelihoods that one hypothesis costs: its sigma points, and the whole body.
-
-        Args:
-            options: the options of the filter, as given to it.
-
-        Returns:
-            Number of likelihoods for each particle and frame.
-        """
+        """Return the number of likelihoods of one hypothesis: its sigma points, and the whole body."""
         return _POINTS + (options.get("weighting") == "body")
 
     @classmethod
     def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
-        """Return the options of tracking: the default diffusion of the root, and legs exchanged now and then.
-
-        Args:
-            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
-
-        Returns:
-            Keyword arguments of the filter.
-        """
+        """Return the options of tracking: the default diffusion of the root, legs exchanged now and then."""
         return {"process_cov": default_step_std(body, fps).square(), "leg_swap": _TRACKING_SWAP}
 
     def start_std(self) -> Float[Tensor, " D"]:
@@ -211,16 +197,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Diffuse the roots, observe the parts, pass messages and weigh (DX 4-14).
-
-        Args:
-            state: the state of the last frame, with resampled particles and the filter's memory of them.
-            frame: the observation of the frame.
-            generator: one generator, or a list of one for each element.
-
-        Returns:
-            `WeightedParticles` [B, N, D] of the next frame.
-        """
+        """Diffuse the roots, observe the parts, pass messages and weigh (DX 4-14)."""
         roots = self._diffuse_roots(state.particles, generator)
         mean = roots[..., _ROOT:].unflatten(-1, (-1, 3))
         covariance = self.conditionals.diffuse(mean, self._memory(state))[1]
@@ -245,13 +222,6 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         """Return covariances with those of the legs exchanged; left and right centres differ a little.
 
         x' = (w I + [v]_x) x + ... to first order, for the rotation (v, w) from one centre to the other.
-
-        Args:
-            memory: the memory of the particles, as in the state.
-            swapped: [B, N], True where a particle has exchanged its legs.
-
-        Returns:
-            Memory of the same shape.
         """
         order = leg_permutation(self.body.skeleton)[1:].to(memory.device)
         centres = self.body.centres.to(memory)
@@ -267,15 +237,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         mean: Float[Tensor, "B D"],
         memory: Tensor | None,
     ) -> Float[Tensor, "B D"]:
-        """Return the deviation about the estimate: of the hypotheses, and within each of them.
-
-        Args:
-            particles: [B, N, D]. log_weights: normalised, [B, N]. mean: the estimate [B, D].
-            memory: the memory of the particles, as in the state.
-
-        Returns:
-            [B, D], metres for the root's position, sines of half angles for rotations.
-        """
+        """Return the deviation about the estimate: of the hypotheses, and within each of them."""
         between = super().spread(particles, log_weights, mean, memory)
         if memory is None:
             return between
@@ -287,14 +249,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def joint_covariance(
         self, state: BodyFilterState, mean: Float[Tensor, "B D"]
     ) -> Float[Tensor, "B J 3 3"]:
-        """Return the second moment about the estimate's joints: of the hypotheses, and within each.
-
-        Args:
-            state: weighted particles after a step. mean: the estimate [B, D].
-
-        Returns:
-            [B, J, 3, 3], square metres, world axes.
-        """
+        """Return the second moment about the estimate's joints: of the hypotheses, and within each."""
         return joint_covariance_with_parts(self.body, state, self._memory(state), mean)
 
     # --- one frame

@@ -60,16 +60,7 @@ class SIRParticleFilter(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Diffuse the particles (MR 29), and weigh them by the image (MR 5).
-
-        Args:
-            state: the state of the last frame, with resampled particles and the filter's memory of them.
-            frame: the observation of the frame.
-            generator: one generator, or a list of one for each element.
-
-        Returns:
-            `WeightedParticles` [B, N, D] of the next frame.
-        """
+        """Diffuse the particles (MR 29), and weigh them by the image (MR 5)."""
         particles = self.diffuse(state.particles, self.step_std, generator)
         log_limits, log_likelihood = self.log_limits(particles), frame.score(particles)
         log_prior = state.log_weights + log_limits
