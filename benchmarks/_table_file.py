@@ -7,6 +7,7 @@ from typing import Annotated
 
 from torchpose._core.files import atomic_path
 from torchpose.errors import InputError
+from torchpose.evaluation import Report
 
 
 def table_file(given: str | Path) -> Path:
@@ -40,6 +41,13 @@ def save_text(path: Path | None, text: str) -> None:
     if path is not None:
         with atomic_path(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
+
+
+def print_tables(report: Report, out: Path | None) -> None:
+    """Print the tables of a report, and write the same to a file, if there is one."""
+    text = "\n\n".join(table.to_markdown() for table in report.values())
+    print(text)
+    save_text(out, f"{text}\n")
 
 
 TableFile = Annotated[Path, table_file]

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from benchmarks import bones
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.unseen_sets import NAMES, Unseen, leave_out
 from torchpose.evaluation import Report
 from torchpose.metrics._calibration import chi2_quantile, mahalanobis_squared
@@ -118,9 +118,7 @@ def main(
             title = f"{method}, {'neck, hands and head' if few else 'all joints'}"
             found = {name: distances(unseen, method, few, every) for name, unseen in sets.items()}
             add_table(report, title, found)
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 if __name__ == "__main__":

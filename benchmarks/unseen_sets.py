@@ -24,7 +24,7 @@ import torchpose
 from benchmarks import bones
 from benchmarks._command import run_command
 from benchmarks._lifters import FEW, LIFTERS, Lifter, fit_lifter
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from torchpose.evaluation import Report
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
@@ -160,9 +160,7 @@ def main(
     report = Report("Sets that nobody knows")
     for name in NAMES[-1:] if quick else NAMES:
         add_set(report, name, leave_out(data, name, quick))
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 if __name__ == "__main__":

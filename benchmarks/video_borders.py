@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.hand_network.clips import BELOW, BURN_IN, PEOPLE, Clip, Labels, read_clips
 from torchpose import PinholeCamera, UpperBodyTracker, VideoTracker, load_prior
 from torchpose._core.images import Image
@@ -268,9 +268,7 @@ def main(
         clips = [clip for clip in clips if clip.name in rows]
     title = "Visible hands that are taken away, and said to be absent"
     add_table(report, "false", title, taken, _FALSE_COLUMNS, (0, 2, 2, 0, 0))
-    text = "\n\n".join(table.to_markdown() for table in report.values())
-    print(text)
-    save_text(out, text + "\n")
+    print_tables(report, out)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from pathlib import Path
 import torch
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.bones.fits import fit_shipped
 from benchmarks.bones.tables import add_group, draw, groups, priors_of
 from torchpose._core.files import check_output_folder
@@ -70,9 +70,7 @@ def main(
         if pictures is not None:
             draw(group, *priors, pictures, name, n_frames=1 if quick else 8)
         add_group(report, group, *priors)
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 if __name__ == "__main__":

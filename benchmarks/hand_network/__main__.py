@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.hand_network.clips import (
     BURN_IN,
     FOLDS,
@@ -229,9 +229,7 @@ def main(
             errors[clip.name] = [elbow_error(clip, network, measured) for measured in (False, True)]
     report = Report("Hands of persons left out")
     add_table(report, scores, errors)
-    text = report["hands"].to_markdown()
-    print(text)
-    save_text(table, text + "\n")
+    print_tables(report, table)
     if pictures is not None:
         for kind, count, path in draw_failures(pictures, found):
             print(f"{kind}: {count} hands, {path}")

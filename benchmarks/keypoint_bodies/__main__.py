@@ -29,7 +29,7 @@ from typing import Annotated
 import torch
 
 from benchmarks._command import OneOf, run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.keypoint_bodies.camera_heights import add_height_table, height_of_kinect
 from benchmarks.keypoint_bodies.choosing import add_choices
 from benchmarks.keypoint_bodies.clips import (
@@ -117,9 +117,7 @@ def main(
             add_table(report, chosen, clips, cameras)
         if not noise_alone:
             _add_recorded_views(report, chosen, data, quick)
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 def _add_heights(

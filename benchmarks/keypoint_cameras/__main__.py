@@ -18,7 +18,7 @@ import torch
 from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.keypoint_bodies.clips import CHOOSING, SCORED, Clip, read_clips
 from benchmarks.keypoint_cameras.disturbed import disturb
 from benchmarks.keypoint_cameras.faulty import add_faulty_cameras
@@ -73,9 +73,7 @@ def main(
         for title, (late, turned, what) in _KINDS.items():
             _add_table(report, title, clips, late, turned, what)
         add_real_cameras(report, data)
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 def _add_table(

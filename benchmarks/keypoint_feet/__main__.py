@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.keypoint_bodies.clips import SCORED
 from benchmarks.keypoint_feet.clips import begun, read_toed
 from benchmarks.keypoint_feet.fit import fit_shipped
@@ -60,9 +60,7 @@ def main(
     for cameras in _RIGS[::2] if quick else _RIGS:
         add_table(report, clips, cameras)
     add_real_table(report, data, frames if quick else None)
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import torch
 from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
-from benchmarks._table_file import TableFile, save_text
+from benchmarks._table_file import TableFile, print_tables
 from benchmarks.keypoint_people.clips import CHOOSING, QUARTET, SCORED, People, meet
 from benchmarks.keypoint_people.methods import METHODS, milliseconds
 from benchmarks.keypoint_people.scoring import PeopleScore, score_people
@@ -62,9 +62,7 @@ def main(
         if chosen:
             _add_table(report, title, chosen)
     _add_times(report, meet(data, QUARTET, seed, frames=_TIMED_FRAMES))
-    tables = [table.to_markdown() for table in report.values()]
-    print("\n\n".join(tables))
-    save_text(out, "\n\n".join(tables) + "\n")
+    print_tables(report, out)
 
 
 def _add_table(report: Report, title: str, clips: Sequence[People]) -> None:
