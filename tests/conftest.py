@@ -52,3 +52,11 @@ def small_windows_file(tmp_path_factory):
     from tests.shared_fits import fit_small_windows, fitted_once
 
     return fitted_once(tmp_path_factory, "small-windows", fit_small_windows)
+
+
+@pytest.fixture(scope="module")
+def prior(small_windows_file):
+    """The prior with windows that is fitted once in a run."""
+    from torchpose.priors import UpperBodyPrior
+
+    return UpperBodyPrior.load(small_windows_file)

@@ -12,14 +12,12 @@ from torchpose.learning import fit_limb_conditionals
 
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
+from tests.train.scenes import check_refusals, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._recipes import LimbStates
 from torchpose.learning._recipes.limbs import held_out_spread
 from torchpose.priors._limb_conditionals import LimbConditionals
-from train.cli import main
 
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / "configs" / "limbs.yaml"
 SWING = {"left_thigh": (0.3, 0.0), "left_shank": (0.2, 0.35), "right_thigh": (0.3, 0.0),
          "right_shank": (0.2, 0.35), "left_upper_arm": (0.2, 0.0), "right_forearm": (0.1, -0.4)}  # fmt: skip
 HERTZ = 1.0
@@ -59,15 +57,7 @@ def scene(tmp_path_factory) -> SimpleNamespace:
         "--data.init_args.paths": f"['{folder}']",
         "--data.init_args.held_out": "[p2]",
     }
-    arguments = ["fit", "--config", str(CONFIG)]
-    arguments += [str(part) for pair in options.items() for part in pair]
-    return SimpleNamespace(home=home, folder=folder, arguments=arguments)
-
-
-def run(scene, name: str, *more: str) -> int:
-    out = ["--prior.out", str(scene.home / f"{name}.safetensors")]
-    folder = ["--trainer.default_root_dir", str(scene.home / "runs" / name)]
-    return main([*scene.arguments, *out, *folder, *more])
+    return scene_of(home, "limbs.yaml", options, folder=folder)
 
 
 def of_edge(conditionals: LimbConditionals, below: str) -> int:
@@ -139,7 +129,8 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
             del arrays["fps"]
         np.savez(path, **arrays)
     nobody = ["--data.init_args.held_out", "null", "--data.init_args.paths"]
-    for more, message in (
+    check_refusals(
+        scene, capsys,
         (["--data.init_args.persons", "[p9]"], "'p9' is nobody's name"),
         (["--data.init_args.actions", "[hop]"], "no recording of hop; there are walk0, walk1"),
         (["--data.init_args.without", "[p9_9]"], "no file named p9_9"),
@@ -149,8 +140,4 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         (["--data", "train.data.RecordingsDataModule"], "train.limbs.LimbData"),
         ([*nobody, f"['{folders['holes']}']"], "p6_0.npz: left_elbow is missing in frame 9"),
         ([*nobody, f"['{folders['timeless']}']"], "does not say its frame rate"),
-    ):
-        assert run(scene, "bad", *more) == 2, more
-        error = capsys.readouterr().err
-        assert message in error and error.count("\n") == 1, error
-    assert not (scene.home / "bad.safetensors").exists()
+    )  # fmt: skip

@@ -13,15 +13,12 @@ from torchpose.learning._manifolds import fit_target, gplvm_of_fit
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.motions import motion
+from tests.train.scenes import check_refusals, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma, run_fit
 from torchpose.learning._recipes import ManifoldFitting
 from torchpose.priors import BackConstrainedGPLVM
-from train.cli import main
 from train.manifold import ManifoldData
-
-ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / "configs" / "manifold.yaml"
 
 
 def write_trial(folder: Path, person: str, trial: int, frames: int, fps: float = 120.0) -> Path:
@@ -56,18 +53,9 @@ def scene(tmp_path_factory) -> SimpleNamespace:
         "--model.init_args.steps": 4,
         "--model.init_args.patience": 9,
         "--model.init_args.start": 1,
+        "--model.init_args.picture": "false",
     }
-    arguments = ["fit", "--config", str(CONFIG)]
-    arguments += [str(part) for pair in options.items() for part in pair]
-    return SimpleNamespace(home=home, folder=folder, arguments=arguments)
-
-
-def run(scene, name: str, *more: str) -> int:
-    out = ["--prior.out", str(scene.home / f"{name}.safetensors")]
-    folder = ["--trainer.default_root_dir", str(scene.home / "runs" / name)]
-    if not any("picture" in option for option in more):
-        more = (*more, "--model.init_args.picture", "false")
-    return main([*scene.arguments, *out, *folder, *more])
+    return scene_of(home, "manifold.yaml", options, folder=folder)
 
 
 def fitted(scene, name: str) -> BackConstrainedGPLVM:
@@ -177,7 +165,8 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         arrays["joints"][9, 4] = np.nan
         np.savez(path, **arrays)
     everybody = ["--data.init_args.persons", "null", "--data.init_args.without", "null"]
-    for more, message in (
+    check_refusals(
+        scene, capsys,
         (["--data.init_args.persons", "[p9]"], "'p9' is nobody's name"),
         (["--data.init_args.without", "[p0_09]"], "no file named p0_09"),
         (["--data.init_args.validation", "3"], "set#p0 has 3 recordings, and 3 of them are to be"),
@@ -188,8 +177,4 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         (["--trainer.precision", "16-true"], "double precision"),
         ([*everybody, "--data.init_args.paths", f"['{holes}']"], "frame 9"),
         (["--data", "train.data.RecordingsDataModule"], "train.manifold.ManifoldData"),
-    ):
-        assert run(scene, "bad", *more) == 2, more
-        error = capsys.readouterr().err
-        assert message in error and error.count("\n") == 1, error
-    assert not (scene.home / "bad.safetensors").exists()
+    )  # fmt: skip

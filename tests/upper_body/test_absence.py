@@ -6,7 +6,6 @@ import torch
 from torchpose import PinholeCamera
 from torchpose.demo import KEYPOINT_NAMES, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._absence import HANDS, absence_of, log_beyond
@@ -15,11 +14,6 @@ N = 24
 HIGH = 300  # rows of an image that ends below the elbows
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, HIGH)
 METHODS = ("window-mixture", "articulated", "multiple-model")
-
-
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

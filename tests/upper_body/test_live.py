@@ -8,17 +8,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError, SkeletonError
-from torchpose.priors import UpperBodyPrior, load_prior
+from torchpose.priors import load_prior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 from torchpose.upper_body._measured_joints import pixels_per_metre
 
 NAMES = list(KEYPOINT_NAMES)
 FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
-
-
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

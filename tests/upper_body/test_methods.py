@@ -29,11 +29,6 @@ NAMES = list(KEYPOINT_NAMES)
 
 
 @pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
-
-
-@pytest.fixture(scope="module")
 def keypoints():
     return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
 

@@ -27,11 +27,6 @@ INFERRED = [
 
 
 @pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
-
-
-@pytest.fixture(scope="module")
 def of_performer():
     return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
 

@@ -10,7 +10,6 @@ import torch
 from torchpose.camera import PinholeCamera
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import FileFormatError
-from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
 from torchpose.upper_body._measured_joints import MeasuredJoints
@@ -26,11 +25,6 @@ def seen(joints, names):
     uv = demo_camera()(joints.double())[:, [UPPER_BODY.index(name) for name in names], :2]
     generator = torch.Generator().manual_seed(0)
     return uv + 3 * torch.randn(uv.shape, generator=generator, dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

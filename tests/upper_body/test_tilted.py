@@ -9,7 +9,6 @@ from torchpose import PinholeCamera
 from torchpose.camera import project
 from torchpose.camera._tilt import Turn
 from torchpose.demo import KEYPOINT_NAMES, noisy_keypoints, performer
-from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
 from torchpose.upper_body._measured_joints import kept_turn
@@ -21,11 +20,6 @@ OF_RAYS = ("articulated", "multiple-model", "window-mixture")
 NAMES = list(KEYPOINT_NAMES)
 MORE = ("head", "neck", "shoulder_left", "shoulder_right", "hand_left", "hand_right", "nose",
         "ear_left", "ear_right")  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

@@ -11,18 +11,12 @@ from torchpose import PinholeCamera, UpperBodyTracker, VideoTracker
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.measure import HaarFaceDetector
-from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 
 N, FIRST = 40, 2  # frames, and the first one in which somebody counts
 FRAMES = np.broadcast_to(np.uint8(90), (N, 480, 640, 3))
 CAMERA = demo_camera()
 FIELDS = ("joints2d", "joints3d", "covariance3d", "observed")
-
-
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
 
 
 class Performers:

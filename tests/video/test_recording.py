@@ -8,18 +8,12 @@ import torch
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.measure._hand_likelihood import without_elbows
 from torchpose.measure._upper_body_measurer import MEASURED, FrameMeasurements, rounded_covariance
-from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.video._person_stream import PersonStream
 from torchpose.video._recording import TrackedRecording
 
 FIELDS = ("joints2d", "joints3d", "covariance3d")
 GAP = 8
-
-
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

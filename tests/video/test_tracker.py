@@ -18,11 +18,6 @@ pytest.importorskip("matplotlib", reason="the performer's face comes from matplo
 FACE = 3  # the head, in `UPPER_BODY`
 
 
-@pytest.fixture(scope="module")
-def prior(small_windows_file):
-    return UpperBodyPrior.load(small_windows_file)
-
-
 class Video(list):
     """Frames with a rate."""
 
