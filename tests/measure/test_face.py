@@ -7,7 +7,8 @@ import torch
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
 from torchpose.measure import HaarFaceDetector
-from torchpose.measure._face import FaceTracker, Region
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._face_detector import Region
 
 
 def nobody(image, region=None):

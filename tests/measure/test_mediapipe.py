@@ -9,7 +9,8 @@ import torch
 
 from torchpose.errors import InputError, MissingDependencyError
 from torchpose.measure import FaceDetector, MediaPipeFaceDetector, MediaPipePose
-from torchpose.measure._face import FaceTracker, Region
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._face_detector import Region
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 

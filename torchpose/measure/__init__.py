@@ -1,7 +1,7 @@
 """Measure faces, skin, hands, edges and foreground in images."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.measure._face import FaceDetector, HaarFaceDetector
+from torchpose.measure._face_detector import FaceDetector, HaarFaceDetector
 from torchpose.measure._hands import HandTracker
 from torchpose.measure._head import HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker

@@ -14,7 +14,7 @@ from torchpose._core.images import Image
 from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, cell_centres, halve
-from torchpose.measure._face import check_faces
+from torchpose.measure._face_detector import check_faces
 
 # turns (y, x) into the vector across
 _ACROSS = torch.tensor([-1.0, 1.0], dtype=torch.float32)[:, None, None]

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchpose._core.checks import check_count, check_grey, check_rgb
 from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError
-from torchpose.measure._face import Region
+from torchpose.measure._face_detector import Region
 from torchpose.skeleton._mediapipe_landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
-from torchpose.measure._face import check_faces
+from torchpose.measure._face_detector import check_faces
 
 BINS = (8, 32, 32)  # of L, a and b
 _LOWEST, _WIDTH = (0.0, -24.0, -24.0), (12.5, 2.0, 3.0)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
 from torchpose.math._mixture_steps import MixtureParameters, natural_parameters
-from torchpose.measure._face import check_faces
+from torchpose.measure._face_detector import check_faces
 from torchpose.measure._skin import FACE_PATCH
 
 _SAMPLES = 16  # across the middle of the face, and down

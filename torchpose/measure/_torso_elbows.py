@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
-from torchpose.measure._face import check_faces
+from torchpose.measure._face_detector import check_faces
 from torchpose.measure._skin import SkinModel, SkinState
 
 # Lengths in sizes of the face, heights from its centre.

@@ -14,7 +14,8 @@ from torchpose._core.images import Image
 from torchpose._core.module_state import as_one_run
 from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
-from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, scaled_back
+from torchpose.measure._face import FaceTracker, FaceTracks
+from torchpose.measure._face_detector import FaceDetector, scaled_back
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior

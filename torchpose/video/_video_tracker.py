@@ -19,7 +19,7 @@ from torchpose.errors import InputError
 from torchpose.measure._association import HandAssociation
 from torchpose.measure._detectors.load import check_detector, load_detector
 from torchpose.measure._detectors.protocol import KeypointDetector
-from torchpose.measure._face import FaceDetector
+from torchpose.measure._face_detector import FaceDetector
 from torchpose.measure._head import HeadNeck
 from torchpose.measure._keypoint_measurer import (
     LEAST_CONFIDENCE,
