@@ -16,7 +16,6 @@ from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import as_one_run, in_own_precision
 from torchpose._core.moved import warn_of_former
 from torchpose.body._kinematics import Body
-from torchpose.body._skeleton import BODY_15
 from torchpose.camera._choice import check_room
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
@@ -37,14 +36,7 @@ from torchpose.whole_body._body_arguments import (
     whole_length,
 )
 from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
-from torchpose.whole_body._filter_table import (
-    LEARNT,
-    METHODS,
-    BodyTrackerOptions,
-    choose_method,
-    make_filter,
-    rebased,
-)
+from torchpose.whole_body._filter_table import BodyTrackerOptions, choose_method
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._following import Observed
@@ -54,8 +46,7 @@ from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, Peop
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 from torchpose.whole_body._measured_keypoints import given_keypoints
 from torchpose.whole_body._particle_follower import ParticleFollower
-
-_HEIGHT = 1.75  # metres, of a person of unknown height
+from torchpose.whole_body._particle_setup import particle_setup
 
 
 class BodyStream(NamedTuple):
@@ -195,24 +186,17 @@ class BodyTracker(nn.Module):
         of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
         refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
         self.method = choose_method(method, given)
-        found = {kind: _model(kind, value, fps) for kind, value in given.items()}
-        models = {kind: model for kind, (model, _) in found.items()}
-        person = rebased(_person(body, _HEIGHT if height is None else height), "parent", None)
-        upright, tracked, learnt = _bodies(self.method, person, models)
-        noise = given_of({"process_cov": process_cov})
-        self.filter = make_filter(
-            self.method, tracked, learnt, fps, n_particles, {**options, **noise}
-        )
+        setup = particle_setup(
+            self.method, given, body, height, fps, n_particles,
+            {**options, **given_of({"process_cov": process_cov})},
+        )  # fmt: skip
+        self.filter, self.notes = setup.filter, setup.notes
         self.cameras, self.n_particles = rig, n_particles
-        self.notes = tuple(note for _, note in found.values() if note)
-        # of the filter where these are the same, so that its tensors are in the state once
-        self._upright = None if upright is tracked else upright
+        self._upright, self._search = setup.upright, setup.manifold
         std = None
         if initial_cov is not None:
-            std = std_of_covariance("initial_cov", initial_cov, tracked.dim)
+            std = std_of_covariance("initial_cov", initial_cov, self.body.dim)
         self.register_buffer("_initial_std", std, persistent=std is not None)
-        own = METHODS[self.method].needs == "manifold"  # then the filter holds it
-        self._search = None if own else models.get("manifold")
         self._by_particles = ParticleFollower(
             self.method, self.filter, self.cameras, self.fps, self._upright, self._search,
             (keypoint_std, pixel_std),
@@ -548,29 +532,6 @@ def _stream_names(state: BodyStream, names: Sequence[str] | None) -> Sequence[st
             "step before returned"
         )
     return state.names if names is None else names
-
-
-def _person(body: Body | str | Path | None, height: float) -> Body:
-    if isinstance(body, Body):
-        return body
-    return Body.of_height(BODY_15, height) if body is None else load_body(body)
-
-
-def _bodies(method: str, person: Body, models: dict[str, Any]) -> tuple[Body, Body, Any]:
-    """Return the body with which the first pose is found, the one that is tracked, and the method's model."""
-    upright, needs = person, METHODS[method].needs
-    if "manifold" in models:
-        upright = LEARNT["manifold"].body(person, models["manifold"])
-    if needs is None:
-        return upright, person, None
-    tracked = upright if needs == "manifold" else LEARNT[needs].body(person, models[needs])
-    return upright, tracked, models[needs]
-
-
-def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
-    """Return a model with its noise for a frame rate, and notes about it."""
-    model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
-    return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
 
 
 set_up_facade(__name__)
