@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks._upper_body import Scores
@@ -9,7 +10,7 @@ from torchpose.evaluation import Report
 from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.evaluation._trials import HANDS, Trials, add_picture
 from torchpose.metrics import jitter
-from torchpose.metrics._pose_errors import share_below
+from torchpose.metrics._pose_errors import PCP, share_below
 from torchpose.priors import UpperBodyPrior
 
 MAIN, LAGGED, SMOOTHED = "MKF filtered", "MKF fixed lag", "MKF smoothed"
@@ -61,21 +62,16 @@ def _own_jitter(test: Trials) -> float:
     return float((each * triples).sum() / triples.sum())
 
 
-def add_pcp_table(report: Report, scores: dict[str, Scores]) -> None:
+def add_pcp_table(report: Report, limbs: Mapping[str, PCP]) -> None:
     """Add the share of correct upper arms and forearms at some thresholds."""
     marks = (0.1, 0.2, 0.3, 0.5)
     columns = [f"{part} {m:g}" for part in ("upper arm", "forearm") for m in marks]
-    table = report.table(
-        "pcp", "Correct limbs in the image (%), both ends within a share of the limb", columns
-    )
-    for name, s in scores.items():
-        at = [int((s.limbs.thresholds - m).abs().argmin()) for m in marks]
-        values = [
-            100 * float(s.limbs.per_limb[limbs][:, i].mean())
-            for limbs in ([0, 2], [1, 3])
-            for i in at
-        ]
-        table.add(name, values)
+    title = "Correct limbs in the image (%), both ends within a share of the limb"
+    table = report.table("pcp", title, columns)
+    for name, found in limbs.items():
+        at = [int((found.thresholds - m).abs().argmin()) for m in marks]
+        pairs = ([0, 2], [1, 3])
+        table.add(name, [100 * float(found.per_limb[pair, i].mean()) for pair in pairs for i in at])
 
 
 def add_calibration_table(report: Report, prior: UpperBodyPrior, scores: dict[str, Scores]) -> None:

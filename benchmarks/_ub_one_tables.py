@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from benchmarks._people_tables import add_pcp_table
 from benchmarks._upper_body import Scores
 from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.evaluation._report import Report, Table
@@ -67,16 +68,11 @@ def add_tables(
         f"({int(raised.sum())} of {raised.numel()} arm-frames). Percentile and largest are over all "
         "joints. Lost frames have no estimate and are not in the other numbers."
     )
-    marks = (0.1, 0.2, 0.3, 0.5)
-    table = report.table(
-        "pcp",
-        "Correct limbs in the image (%), both ends within a share of the limb",
-        [f"{part} {m:g}" for part in ("upper arm", "forearm") for m in marks],
+    curves = {name: torch.stack([s.limbs.per_limb for s in runs]) for name, runs in scores.items()}
+    add_pcp_table(
+        report,
+        {name: scores[name][0].limbs._replace(per_limb=c.mean(0)) for name, c in curves.items()},
     )
-    for name, runs in scores.items():
-        curves = torch.stack([s.limbs.per_limb for s in runs]).mean(0)
-        at = [int((runs[0].limbs.thresholds - m).abs().argmin()) for m in marks]
-        table.add(name, [100 * float(curves[p, i].mean()) for p in ([0, 2], [1, 3]) for i in at])
     table = report.table(
         "time",
         "Time of one iteration of one arm (ms)",

@@ -84,7 +84,7 @@ def run(
         quick: few frames and particles, one run, to see that all of it works.
         manifold: name or file of a manifold. conditionals: of limb conditionals. action: of an action
             space or bank.
-        persons: who is tracked; everybody whom no model knows if nobody is named.
+        persons: who is tracked; everybody to whom no model was fitted if nobody is named.
         actions: only recordings of these; all if none is named.
         clips: recordings tracked of each person and action; others tell bone lengths and radii.
         frames: of each, from its first. fps: rate of the frames.

@@ -123,7 +123,7 @@ def run(
     some = {n: t for n, t in trackers.items() if n in (MAIN, SMOOTHED, BASELINE) or DEFAULT in n}
     moved = _all_methods(some, moving, projected, out, progress, "moving: trackers")
     add_error_tables(report, scores, moved, still, moving)
-    add_pcp_table(report, scores)
+    add_pcp_table(report, {name: s.limbs for name, s in scores.items()})
     add_calibration_table(report, prior, scores)
     if n_gap_sequences:
         add_gap_tables(report, out, prior, poses, fps, seed, n_gap_sequences, progress, quick)

@@ -1,7 +1,7 @@
 """Joints in the image, measured in video: the paper's Figures 12 and 13 on seven webcam clips.
 
 The pipeline (face, skin, hands, filter) and, beside it, the same filter fed with MediaPipe's head, neck
-and hands, or with its head and neck alone (what the prior knows without hands), against MediaPipe's 2D
+and hands, or with its head and neck alone (what the prior alone says of hands), against MediaPipe's 2D
 joints (`*_pose1.npz`, the full model) where their visibility is 0.5 or more, in the image, after 15
 frames. Elbows and shoulders are inferred, never measured. The paper compares itself with Eichner et al.
 (2012), whose code is not to be had; MediaPipe's joints are the reference here as Kinect's are there, and

@@ -31,7 +31,7 @@ def terminate(signum: int, _: Any, first: Callable[[], None] = lambda: None) -> 
 
 
 def _interrupt(signum: int, _: Any) -> None:
-    """Raise what Python raises at Ctrl-C, and remember it."""
+    """Raise what Python raises at Ctrl-C, and note it."""
     _received.append(signum)
     raise KeyboardInterrupt
 

@@ -11,8 +11,8 @@ nothing is aligned.
 - Persons s7 and s8 of UTD-MHAD are seen by the test camera of UB-people.
 
 The prior over arms is fitted without the set that is scored, for UTD-MHAD without these two persons. The
-other methods have the prior that comes with torchpose, which knows none of these persons; for UTD-MHAD one
-that is fitted to s1 to s6 as in UB-people.
+other methods have the prior that comes with torchpose, which was fitted to none of these persons; for
+UTD-MHAD one that is fitted to s1 to s6 as in UB-people.
 
     python -m benchmarks.bones --data DIR [--out FILE] [--pictures FOLDER]
     python -m benchmarks.bones --data DIR --fit FILE.safetensors

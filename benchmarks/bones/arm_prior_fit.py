@@ -1,4 +1,4 @@
-"""Fit a prior over arms that knows no camera, to recordings of any sets together."""
+"""Fit a prior over arms that depends on no camera, to recordings of any sets together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hands in video of persons that the network was not fitted to, beside what knows no persons.
+"""Hands in video of persons that the network was not fitted to, beside what needs no network.
 
     python -m benchmarks.hand_network --data DIR --out FOLDER [--table FILE] [--pictures FOLDER]
     python -m benchmarks.hand_network --data DIR --out FOLDER --fit FILE.safetensors
@@ -145,7 +145,7 @@ def facts(clips: Sequence[Clip], name: str, command: str) -> HandNetworkInfo:
 def add_table(
     report: Report, scores: dict[str, tuple[Score, ...]], errors: dict[str, list[float]]
 ) -> None:
-    """Add the scores of all clips, without and with a network that knows nobody in them.
+    """Add the scores of all clips, without and with a network that was fitted without their persons.
 
     Args:
         report: of the benchmark. scores: without and with the network. errors: of the poses' elbows,
@@ -190,7 +190,7 @@ def main(
     Args:
         data: folder with the clips.
         out: folder for what is kept.
-        fit: file for a network that knows everybody.
+        fit: file for a network that is fitted to everybody.
         table: file for the table, or a folder.
         pictures: folder for drawings of the hands that are wrong.
         threads: cores.

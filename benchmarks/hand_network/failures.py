@@ -46,7 +46,7 @@ def failures(found: Found, labels: Labels) -> Iterator[tuple[int, str]]:
 
 
 def _kind(found: Found, labels: Labels, t: int, hand: int, near: float) -> str | None:
-    """Return how a hand is wrong; None if it is right, or if nobody knows where it is."""
+    """Return how a hand is wrong; None if it is right, or has no label."""
     seen, truth = int(labels.seen[t, hand]), labels.centres[t, :2]
     point, face = found.points[t, 0, hand], found.faces[t]
     if not bool(found.measured[t, 0, hand]):

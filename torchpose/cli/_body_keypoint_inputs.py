@@ -155,7 +155,7 @@ def read_body_keypoints(
         _read(path, detector, fps, everybody, camera.image_size)
         for path, camera in zip(inputs, cameras, strict=True)
     ]
-    _refuse_twice([_contents(part) for part in parts], inputs)
+    _refuse_twice([part.points.numpy().tobytes() for part in parts], inputs)
     fitted = [
         fit_to_size(camera, part.size, path)
         for camera, part, path in zip(cameras, parts, inputs, strict=True)
@@ -182,11 +182,6 @@ def _refuse_twice(values: Sequence[object], inputs: Sequence[str]) -> None:
                 f"{inputs[values.index(value)]} and {inputs[i]} hold the same keypoints, which two cameras "
                 "cannot see; give each camera its own"
             )
-
-
-def _contents(part: CameraKeypoints) -> bytes:
-    """Return the keypoints of a camera, to be compared."""
-    return part.points.numpy().tobytes()
 
 
 def _crowd_notes(

@@ -120,7 +120,7 @@ def options_of(
         if name in leave_out or name in found or kind is None:
             continue
         if parameter.default is not None:
-            kind = kind | None if _takes_none(hint) else kind
+            kind = kind | None if type(None) in typing.get_args(hint) else kind
         elif kind not in (int, float, str) and not _words(kind):
             kind = kind | None  # what is typed may be null
         found[name] = Option(
@@ -251,10 +251,6 @@ def _given_on_a_line(hint: Any) -> Any:
 
 def _is_list(hint: Any) -> bool:
     return typing.get_origin(hint) in (list, tuple, typing.get_origin(Sequence[str]))
-
-
-def _takes_none(hint: Any) -> bool:
-    return type(None) in typing.get_args(hint)
 
 
 def _words(kind: Any) -> tuple[str, ...]:

@@ -160,7 +160,7 @@ def _known_to_arms(persons: Set[str], method: str) -> list[str]:
 
 
 def _check_arms(known: Sequence[str]) -> None:
-    """Raise `OverlapError` if there are persons whom the prior over arms knows."""
+    """Raise `OverlapError` if there are persons to whom the prior over arms was fitted."""
     if known:
         raise OverlapError(
             f"the prior over arms that comes with the package was fitted on {', '.join(known)}; score "

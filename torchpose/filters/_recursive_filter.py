@@ -118,7 +118,7 @@ class RecursiveFilter(WideModule, ABC):
     and noise have the same arguments in all of them.
 
     A filter implements `init` and `filter_frame`, which get checked arguments. It may override
-    `filter_frames`, the loop over time, where it knows a faster way, and `smooth_frames`.
+    `filter_frames`, the loop over time, where it has a faster way, and `smooth_frames`.
 
     Args:
         measurement_cov: R, [Z, Z] or its diagonal [Z].

@@ -1,4 +1,4 @@
-"""Compute with Gaussians, mixtures and rotations; nothing here knows about poses."""
+"""Compute with Gaussians, mixtures and rotations; nothing here is about poses."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.math._gaussian import kalman_predict, kalman_update

@@ -134,7 +134,7 @@ def propagate(
         belief = belief.index_add(-3, level.above, message)
         from_below.append(message)
     for level, upward in zip(levels, reversed(from_below), strict=True):
-        # what the node above knows from itself and from above, and from its other children
+        # what is known of the node above from itself, from above, and from its other children
         others = torch.einsum("cs,...sij->...cij", level.siblings.to(mean.dtype), upward)
         own = _moments(without.index_select(-3, level.above) + others)
         message = _information(*transport(*own, level.edges, False))

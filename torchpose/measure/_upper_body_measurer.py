@@ -111,7 +111,7 @@ class PersonsView(NamedTuple):
 
 
 class MeasurerState(NamedTuple):
-    """Holds what was seen of the persons, and what the hand tracker believes of their hands."""
+    """Holds what was seen of the persons, and the state of their hand trackers."""
 
     seen: SeenPersons
     hands: HandBeliefs | MeanShiftHandState

@@ -1,4 +1,4 @@
-"""Hold a prior over arms that knows no camera: directions of limbs, lengths of bones."""
+"""Hold a prior over arms that depends on no camera: directions of limbs, lengths of bones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchpose.errors import InputError, PriorError
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 LENGTHS = ("upper_arm", "forearm", "forearm_to_hand", "shoulder_width", "head_height")
-"""Lengths that an `ArmPrior` knows: shoulder to elbow, elbow to wrist, elbow to the middle of the hand,
+"""Lengths of an `ArmPrior`: shoulder to elbow, elbow to wrist, elbow to the middle of the hand,
 between the shoulders, and from Kinect's neck up to the head."""
 
 _SPHERES = 2 * math.log(4 * math.pi)  # log of the area of S^2 x S^2

@@ -1,4 +1,4 @@
-"""Name the facts about a fit that only whoever fits knows."""
+"""Name the facts about a fit that do not follow from its data."""
 
 from typing import Any, TypedDict
 

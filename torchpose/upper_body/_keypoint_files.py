@@ -33,7 +33,7 @@ class TrackSettings:
         prior: the name of a prior that comes with torchpose, or a .safetensors file.
         method: the name of an estimator; by default articulated if wrists are measured and the prior has
             hands, else multiple-model if the prior has windows that suit, else articulated or mkf-fixed; in a
-            video, articulated if its prior over arms knows everybody whom the prior knows.
+            video, articulated if its prior over arms was fitted to all persons of the prior.
         camera: the camera: a TOML file, or four numbers fx,fy,cx,cy in pixels; by default K or the image
             size of the input.
         camera_name: the name of the camera in a file that has several.

@@ -179,7 +179,7 @@ def _log_odds(
 def _exchange(
     model: ScreenModel, state: ScreenState, odds: _Odds, apart: Bool[Tensor, " B"]
 ) -> tuple[ScreenState, _Odds, Int[Tensor, " B"]]:
-    """Return the state that knows the most probable way to exchange left and right, its odds, and the way.
+    """Return the state after the most probable way to exchange left and right, its odds, and the way.
 
     It begins only where it puts both hands well on their tracks and these are apart: hands that meet may
     part in two ways. One that lasts is no exchange: the tracks are, and take the other side's place.

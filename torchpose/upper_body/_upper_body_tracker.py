@@ -89,8 +89,8 @@ class UpperBodyTracker(WideModule):
       frame and the hands round it, each frame by itself; filters of constant velocity follow. The body
       is seen through a virtual camera that follows it, so that it may move about, farther away or
       beside the views that the prior was fitted to.
-    - ``articulated``: arms of bones that keep their lengths, under a prior over directions that knows
-      no camera and no size; for all joints measured, of anybody.
+    - ``articulated``: arms of bones that keep their lengths, under a prior over directions that
+      depends on no camera and no size; for all joints measured, of anybody.
     - ``multiple-model``: both of these, averaged by what they predicted of elbows and hands; for strangers of
       whom few joints are measured.
     - ``mkf-fixed``, ``mkf-sampled``, ``mkf-split``: banks of Kalman filters over single poses (BL
@@ -259,7 +259,7 @@ class UpperBodyTracker(WideModule):
             keypoints: [B, T, J, 2], pixels of the camera; NaN where one is missing.
             confidence: [B, T, J], 0 to 1, by which the measurement covariance is divided, and by which a
                 keypoint may be an outlier (docs/mathematics.md, "Outliers"); 0 or NaN where it is missing.
-            names: the names of the J joints, in any order and spelling that `torchpose.skeleton` knows;
+            names: the names of the J joints, in any order and spelling of `torchpose.skeleton`;
                 may be left out if J = 8 and they are in the order of `UPPER_BODY`. Nose, eyes and ears
                 tell "articulated" where the body faces.
             mask: [B, T, J], False where the keypoint is to be ignored.

@@ -387,7 +387,7 @@ def _keypoint_measurer(
 
 
 def _method_of(prior: UpperBodyPrior, options: TrackerOptions) -> str | None:
-    """Return bones alone where these know everybody that the prior knows, else None for the usual choice."""
+    """Return bones alone where these were fitted to all persons of the prior, else None."""
     of_others = {"window", "steady", *MethodOptions.__annotations__} - set(method_options(BONES))
     given = {name for name, value in options.items() if value is not None}
     persons = set(prior.info.persons)

@@ -29,7 +29,7 @@ class MediaPipeDetector:
         self._pose, self._frame = MediaPipePose(*self._settings), 0
 
     def reset(self) -> None:
-        """Begin another video: the model forgets whom it followed."""
+        """Begin another video, without the persons whom the model followed."""
         if self._frame:
             self._pose.close()
             self._pose, self._frame = MediaPipePose(*self._settings), 0

@@ -31,7 +31,7 @@ class KeypointDetector(Protocol):
     """Detects the keypoints of all persons in an image.
 
     Attributes:
-        names: of the J keypoints, in spellings that `torchpose.skeleton` knows.
+        names: of the J keypoints, in spellings of `torchpose.skeleton`.
 
     Two more members are used where they exist: `neck`, the kind of neck where the names do not tell it, and
     `reset()`, which is called before a video begins.

@@ -119,8 +119,8 @@ class BodyFilterState(NamedTuple):
     Attributes:
         particles: [B, N, D]. log_weights: normalised, [B, N], float64. mean: last estimate [B, D].
         lost: number of frames in a row in which all particles died, [B].
-        memory: what a filter remembers of every particle beside its state, [B, N, ...]; resampled
-            with them. trend: what it remembers of every element, [B, ...].
+        memory: what a filter keeps of every particle beside its state, [B, N, ...]; resampled
+            with them. trend: what it keeps of every element, [B, ...].
     """
 
     particles: Tensor

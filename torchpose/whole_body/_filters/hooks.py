@@ -57,7 +57,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """
 
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
-        """Return what the filter remembers of new particles beside their states; nothing by default.
+        """Return what the filter keeps of new particles beside their states; nothing by default.
 
         Args:
             particles: [B, N, D], metres and quaternion vectors.
@@ -68,7 +68,7 @@ class BodyFilterHooks(nn.Module, ABC):
         return None
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
-        """Return what the filter remembers of an element before its first frame; nothing by default.
+        """Return what the filter keeps of an element before its first frame; nothing by default.
 
         Args:
             mean: the first estimate [B, D].

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torchpose._core.module_state import derived
 from torchpose.body._articulation import BodyPoint
 from torchpose.camera._rig import CameraRig
+from torchpose.math._gaussian import point_blocks
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_transition import (
     BodyTransition,
@@ -33,7 +34,6 @@ from torchpose.whole_body._keypoints.body_transition import (
 )
 from torchpose.whole_body._keypoints.information_step import (
     InformationStep,
-    blocks_of,
     information_step,
     plus_one,
     unit,
@@ -285,7 +285,7 @@ class BodyKalmanFilter(nn.Module):
             d = step.step
             point = self.articulation.moved(state.mean, d)
             UH = step.U @ found.H.mT
-            joint_cov, G, found = blocks_of(found.G - UH.mT @ UH), found.G, None
+            joint_cov, G, found = point_blocks(found.G - UH.mT @ UH), found.G, None
         assert joint_cov is not None  # there is a step at least
         return self._corrected(state, readings, point, joint_cov, step, G)
 
@@ -305,7 +305,7 @@ class BodyKalmanFilter(nn.Module):
         seen = see(self.maps, joints)
         weighed = weigh(
             readings, seen, self.maps, state.beliefs, self.exchange,
-            blocks_of(G) if joint_cov is None else joint_cov,
+            point_blocks(G) if joint_cov is None else joint_cov,
             marginal=joint_cov is None, decide=width < _DECIDED, width=width,
         )  # fmt: skip
         return _Linearised(H, HP, G, seen, weighed)
@@ -397,7 +397,7 @@ class BodyKalmanFilter(nn.Module):
         self, state: BodyGaussian, readings: KeypointFrame, found: _Linearised
     ) -> tuple[Float[Tensor, "B J"], Bool[Tensor, "B J"]]:
         """Return the log-odds of joints elsewhere than predicted, given the keypoints, and which are."""
-        far = blocks_of(found.G) + _JUMP**2 * unit(3, found.G)
+        far = point_blocks(found.G) + _JUMP**2 * unit(3, found.G)
         at_large = weigh(
             readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )

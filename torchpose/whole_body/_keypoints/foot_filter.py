@@ -21,7 +21,7 @@ from torchpose._core.module_state import derived
 from torchpose.body._articulation import Articulation
 from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._skeleton import BODY_15, other_side
-from torchpose.math._gaussian import safe_cholesky
+from torchpose.math._gaussian import point_blocks, safe_cholesky
 from torchpose.math._rotations import cross_matrix, exponential
 from torchpose.priors._foot_prior import FootPrior
 from torchpose.whole_body._keypoints.foot_motion import (
@@ -33,7 +33,7 @@ from torchpose.whole_body._keypoints.foot_motion import (
     Legs,
     foot_motion,
 )
-from torchpose.whole_body._keypoints.information_step import blocks_of, information_step
+from torchpose.whole_body._keypoints.information_step import information_step
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Beliefs,
     Exchange,
@@ -166,7 +166,7 @@ class FootFilter(nn.Module):
         if bool((frame.inlier > 0).any()):
             exchange = Exchange(self._mirror, self._legs)
             readings, seen = readings_of(frame, exchange), see(maps, points.flatten(1, 2))
-            spread = blocks_of(G).flatten(1, 2)
+            spread = point_blocks(G).flatten(1, 2)
             weighed = weigh(readings, seen, maps, beliefs, exchange, spread, marginal=True)
             W, b = (value.unflatten(1, (2, 3)) for value in information(readings, seen, weighed))
             step = information_step(H, HP, G, W, b, torch.zeros_like(state.mean))
@@ -174,7 +174,7 @@ class FootFilter(nn.Module):
             state = state._replace(mean=state.mean + step.step, cov=(cov + cov.mT) / 2)
             points = points + (H @ step.step[..., None]).unflatten(-2, (3, 3)).squeeze(-1)
             G, inlier = G - UH.mT @ UH, weighed.inlier
-        return state, self._poses(state, legs, points, blocks_of(G), inlier)
+        return state, self._poses(state, legs, points, point_blocks(G), inlier)
 
     def predict(
         self, before: FootGaussian | None, legs: Legs, fresh: Bool[Tensor, " B"]
@@ -206,7 +206,7 @@ class FootFilter(nn.Module):
     def poses(self, state: FootGaussian, legs: Legs, inlier: Tensor) -> FootPoses:
         """Return the feet of states."""
         points, H = self.linearise(state.mean, legs)
-        return self._poses(state, legs, points, blocks_of(H @ state.cov @ H.mT), inlier)
+        return self._poses(state, legs, points, point_blocks(H @ state.cov @ H.mT), inlier)
 
     def _poses(
         self, state: FootGaussian, legs: Legs, points: Tensor, cov: Tensor, inlier: Tensor

@@ -62,9 +62,3 @@ def _factors(W: Float[Tensor, "*batch J 3 3"]) -> Tensor:
     """Return Cholesky factors of information that may be singular."""
     least = _JITTER * W.diagonal(dim1=-2, dim2=-1).sum(-1) + _LEAST_INFORMATION
     return torch.linalg.cholesky(W + least[..., None, None] * unit(3, W))
-
-
-def blocks_of(matrix: Float[Tensor, "*batch J3 J3"]) -> Float[Tensor, "*batch J 3 3"]:
-    """Return the diagonal blocks of three rows."""
-    blocks = matrix.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
-    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)

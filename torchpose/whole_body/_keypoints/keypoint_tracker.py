@@ -364,14 +364,14 @@ class KeypointTracker(nn.Module):
     def _lifted(
         self, stream: KeypointStream | None, frame: KeypointFrame
     ) -> tuple[Float[Tensor, "B L W"], Lifted | None]:
-        """Return what the network keeps in mind, and what it lifts in a frame of one camera."""
+        """Return the state of the recurrent network, and what it lifts in a frame of one camera."""
         if self.lifter is None:
             return self._no_memory(frame) if stream is None else stream.memory, None
         lifted, memory = self.lifter(frame, None if stream is None else stream.memory)
         return memory, lifted
 
     def _no_memory(self, frame: KeypointFrame) -> Float[Tensor, "B L W"]:
-        """Return what a network keeps in mind that has seen nothing."""
+        """Return the state of the recurrent network before the first frame."""
         return torch.zeros(len(frame.inlier), *MEMORY, device=frame.inlier.device)
 
     def _followed(

@@ -103,7 +103,7 @@ class PoseLifter(nn.Module):
     def forward(
         self, frame: KeypointFrame, memory: Float[Tensor, "B L W"] | None
     ) -> tuple[Lifted, Float[Tensor, "B L W"]]:
-        """Return joints relative to the pelvis in world axes, and what the network keeps in mind.
+        """Return joints relative to the pelvis in world axes, and the state of the recurrent network.
 
         Args:
             frame: of keypoints. memory: of the frame before; None at the beginning.

@@ -21,7 +21,7 @@ INPUTS = 4 * _JOINTS + 4
 """Number of `lifting_features`."""
 _WIDTH, _LAYERS = 256, 2
 MEMORY = (_LAYERS, _WIDTH)
-"""Sizes of what a network keeps in mind."""
+"""Sizes of the state of the recurrent network."""
 _UNIT = 0.3  # metres of an output
 _RATE, _RATES = 60.0, (0.25, 1.0)  # frames per second of an input, and its limits
 _FARTHEST, _SMALLEST = 5.0, 1e-3  # extents of a body from its middle; extent of a ray
@@ -82,7 +82,7 @@ class LiftingNetwork(FittedNetwork):
     def forward(
         self, seen: Float[Tensor, "B T F"], memory: Float[Tensor, "B L W"] | None = None
     ) -> tuple[Lifted, Float[Tensor, "B L W"]]:
-        """Return the joints of every frame, and what the network keeps in mind.
+        """Return the joints of every frame, and the state of the recurrent network.
 
         The standard deviations pass no gradients on to the layers that they share with the joints.
 
