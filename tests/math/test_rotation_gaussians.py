@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.math.scipy_rotations import local, scipy
 from torchpose.errors import InputError
 from torchpose.math import (
     angle_to_edge,
@@ -25,18 +26,6 @@ def rotation(degrees):
     quaternion = Rotation.from_rotvec(np.asarray(degrees), degrees=True).as_quat()
     quaternion *= np.where(quaternion[..., 3:] < 0, -1, 1)
     return torch.as_tensor(quaternion[..., :3])
-
-
-def scipy(vectors):
-    vectors = vectors.numpy()
-    w = np.sqrt((1 - (vectors**2).sum(-1, keepdims=True)).clip(0))
-    return Rotation.from_quat(np.concatenate([vectors, w], -1))
-
-
-def local(rotations, centre):
-    """Vectors of SciPy's rotations in the space around a centre."""
-    quaternion = (scipy(centre).inv() * rotations).as_quat()
-    return quaternion[:, :3] * np.where(quaternion[:, 3:] < 0, -1, 1)
 
 
 def covariance(seed, std=0.08, batch=()):

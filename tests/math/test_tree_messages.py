@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
+from tests.math.scipy_rotations import local, scipy
 from torchpose.errors import ShapeError, SkeletonError
 from torchpose.math import compose
 from torchpose.math._tree_messages import message_tree, propagate
@@ -139,16 +139,6 @@ def test_a_lost_element_stays_alone():
 
 
 # --- rotations ------------------------------------------------------------------------------------
-
-
-def scipy(vectors):
-    w = np.sqrt((1 - (vectors**2).sum(-1, keepdims=True)).clip(0))
-    return Rotation.from_quat(np.concatenate([vectors, w], -1))
-
-
-def local(rotations, centre):
-    quaternion = (scipy(centre).inv() * rotations).as_quat()
-    return quaternion[:, :3] * np.where(quaternion[:, 3:] < 0, -1, 1)
 
 
 def limbs(g, edges, n_nodes, std):

@@ -3,23 +3,13 @@
 import pytest
 import torch
 
-from tests.priors.poses import poses
-from torchpose.camera import ViewRange
+from tests.learning.test_samplers import FRONT, LAYOUT, MATRIX, sequence
 from torchpose.camera._virtual_camera import BodyPath
 from torchpose.errors import PriorError
 from torchpose.learning._samplers import PoseFrames, WindowSource, all_samples
 from torchpose.priors import GaussianMixture
 from torchpose.priors._arm_state import mirror_arm_state
 from torchpose.priors._window import WindowLayout, WindowPrior, augment_bodies, window_measurements
-
-MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
-FRONT = ViewRange(roll=0, pitch=0, yaw=0, tx=(0, 0), ty=(0, 0), tz=(2, 2))
-LAYOUT = WindowLayout(own=(2, -1), other=(0,))
-
-
-def sequence(n=12):
-    moving = poses(n, seed=1, offset=(0, 0, 0))
-    return moving - moving[:, 4:5]
 
 
 def states(layout=LAYOUT, n_samples=12, views=FRONT, **bodies):

@@ -1,9 +1,11 @@
 """Run `python -m train fit` on made-up recordings, and check what it refuses."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+
+import numpy as np
 
 from train.cli import main
 
@@ -31,3 +33,16 @@ def check_refusals(scene: SimpleNamespace, capsys, *cases: tuple[list[str], str]
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1, error
     assert not (scene.home / "bad.safetensors").exists()
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Write an .npz anew after a change of its arrays."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    change(arrays)
+    np.savez(path, **arrays)
+
+
+def make_hole(arrays: dict[str, Any]) -> None:
+    """Take a joint out of one frame of a recording."""
+    arrays["joints"][9, 4] = np.nan

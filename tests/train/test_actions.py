@@ -12,7 +12,7 @@ from torchpose.learning import fit_action_space
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.performances import performances
-from tests.train.scenes import check_refusals, run, scene_of
+from tests.train.scenes import check_refusals, make_hole, rewrite, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._recipes import Performances
 from torchpose.priors import ActionBank, ActionSpace
@@ -140,11 +140,7 @@ def test_it_is_resumed_only_with_its_own_settings(scene, capsys) -> None:
 def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     holes = scene.home / "holes"
     holes.mkdir(exist_ok=True)
-    path = write_recording(holes, "p6", 0)
-    with np.load(path) as file:
-        arrays = dict(file)
-    arrays["joints"][9, 4] = np.nan
-    np.savez(path, **arrays)
+    rewrite(write_recording(holes, "p6", 0), make_hole)
     timeless = scene.home / "timeless"
     timeless.mkdir(exist_ok=True)
     write_recording(timeless, "p7", 0, fps=None)
@@ -152,10 +148,7 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     short.mkdir(exist_ok=True)
     for person in ("p1", "p2"):
         path = write_recording(short, person, 0)
-        with np.load(path) as file:
-            arrays = dict(file)
-        arrays["joints"] = arrays["joints"][:3]
-        np.savez(path, **arrays)
+        rewrite(path, lambda arrays: arrays.update(joints=arrays["joints"][:3]))
     nobody = ["--data.init_args.held_out", "null"]
     check_refusals(
         scene, capsys,

@@ -12,7 +12,7 @@ from torchpose.learning import fit_limb_conditionals
 
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
-from tests.train.scenes import check_refusals, run, scene_of
+from tests.train.scenes import check_refusals, make_hole, rewrite, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._recipes import LimbStates
 from torchpose.learning._recipes.limbs import held_out_spread
@@ -117,17 +117,10 @@ def test_it_is_resumed_only_with_its_own_settings(scene, capsys) -> None:
 
 def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     folders = {}
-    for name in ("holes", "timeless"):
+    for name, change in (("holes", make_hole), ("timeless", lambda arrays: arrays.pop("fps"))):
         folders[name] = scene.home / name
         folders[name].mkdir(exist_ok=True)
-        path = write_trial(folders[name], "p6", 0)
-        with np.load(path) as file:
-            arrays = dict(file)
-        if name == "holes":
-            arrays["joints"][9, 4] = np.nan
-        else:
-            del arrays["fps"]
-        np.savez(path, **arrays)
+        rewrite(write_trial(folders[name], "p6", 0), change)
     nobody = ["--data.init_args.held_out", "null", "--data.init_args.paths"]
     check_refusals(
         scene, capsys,

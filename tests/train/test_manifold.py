@@ -13,7 +13,7 @@ from torchpose.learning._manifolds import fit_target, gplvm_of_fit
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.motions import motion
-from tests.train.scenes import check_refusals, run, scene_of
+from tests.train.scenes import check_refusals, make_hole, rewrite, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma, run_fit
 from torchpose.learning._recipes import ManifoldFitting
@@ -159,11 +159,7 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     holes = scene.home / "holes"
     holes.mkdir(exist_ok=True)
     for trial in range(2):
-        path = write_trial(holes, "p6", trial, 40)
-        with np.load(path) as file:
-            arrays = dict(file)
-        arrays["joints"][9, 4] = np.nan
-        np.savez(path, **arrays)
+        rewrite(write_trial(holes, "p6", trial, 40), make_hole)
     everybody = ["--data.init_args.persons", "null", "--data.init_args.without", "null"]
     check_refusals(
         scene, capsys,

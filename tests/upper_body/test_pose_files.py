@@ -83,7 +83,11 @@ BODIES = {
 }
 
 
-def refused(cls, path, capsys):
+def changed_is_refused(cls, path, change, capsys):
+    with np.load(path) as file:
+        arrays = dict(file)
+    change(arrays)
+    np.savez(path, **arrays)
     with pytest.raises(TorchposeError, match=path.name) as caught:
         cls.load(path)
     assert str(caught.value).isprintable()
@@ -95,21 +99,13 @@ def refused(cls, path, capsys):
 @pytest.mark.parametrize("what", TRACKS)
 def test_poses_that_do_not_agree(tmp_path, capsys, what):
     pose_track().save(tmp_path / "poses.npz")
-    with np.load(tmp_path / "poses.npz") as file:
-        arrays = dict(file)
-    TRACKS[what](arrays)
-    np.savez(tmp_path / "poses.npz", **arrays)
-    refused(PoseTrack, tmp_path / "poses.npz", capsys)
+    changed_is_refused(PoseTrack, tmp_path / "poses.npz", TRACKS[what], capsys)
 
 
 @pytest.mark.parametrize("what", BODIES)
 def test_bodies_that_do_not_agree(tmp_path, capsys, what):
     body_poses().save(tmp_path / "body.npz")
-    with np.load(tmp_path / "body.npz") as file:
-        arrays = dict(file)
-    BODIES[what](arrays)
-    np.savez(tmp_path / "body.npz", **arrays)
-    refused(BodyTrack, tmp_path / "body.npz", capsys)
+    changed_is_refused(BodyTrack, tmp_path / "body.npz", BODIES[what], capsys)
 
 
 @pytest.mark.parametrize("batch", [1, 2])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.upper_body.test_bvh import track_of as of_joints
 from torchpose.demo import performer
 from torchpose.errors import InputError, OutputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
@@ -58,18 +59,7 @@ def track_of(n: int = 20, seed: int = 0, fps: float | None = 30.0) -> PoseTrack:
     root = 0.1 * torch.randn(1, n, 8, 3, 3, generator=g, dtype=torch.float64)
     observed = torch.rand(1, n, 8, generator=g) < 0.7
     observed[..., 1] = False
-    return PoseTrack(
-        joints2d=torch.zeros(1, n, 8, 2),
-        joints3d=joints[None],
-        covariance2d=torch.zeros(1, n, 8, 2, 2),
-        covariance3d=root @ root.mT,
-        observed=observed,
-        log_evidence=torch.zeros(1, n, 2),
-        lengths=torch.tensor([n]),
-        matrix=torch.eye(3),
-        failed_at=torch.tensor([-1]),
-        fps=fps,
-    )
+    return replace(of_joints(joints, fps), covariance3d=root @ root.mT, observed=observed)
 
 
 def unpack(packed: dict) -> np.ndarray:
