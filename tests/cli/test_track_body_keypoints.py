@@ -80,14 +80,38 @@ def keypoints_of(points, **more) -> Keypoints:
     return Keypoints(points, BODY_15.names, None, **facts)
 
 
+def write_cameras(folder) -> list[PinholeCamera]:
+    """The cameras of the scenes, in cameras.toml."""
+    cameras = [looking_at(name, place) for name, place in PLACES.items()]
+    save_cameras(cameras, folder / "cameras.toml")
+    return cameras
+
+
+def write_videos(folder) -> None:
+    """Grey videos of all cameras."""
+    for name in PLACES:
+        with VideoWriter(folder / f"{name}.mp4", FPS, (WIDTH, HEIGHT)) as writer:
+            for _ in range(N):
+                writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+
+
+def on_files(torchpose, folder, *always):
+    """The command on files of a folder: run(out, "front_json", ..., "--option") -> Result."""
+
+    def run(out, *words):
+        given = [folder / w if isinstance(w, str) and (folder / w).exists() else w for w in words]
+        return torchpose("track-body", folder / "cameras.toml", *given, *always, "--out", out)
+
+    return run
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A folder with cameras.toml, front_json/, left.csv and behind.npz, and the true joints [N, 15, 3]."""
     folder = tmp_path_factory.mktemp("keypoints")
     body = Body.of_height(BODY_15, 1.75)
     joints = body.joints(arms_rise(body))
-    cameras = [looking_at(name, place) for name, place in PLACES.items()]
-    save_cameras(cameras, folder / "cameras.toml")
+    cameras = write_cameras(folder)
     generator = torch.Generator().manual_seed(0)
     points = CameraRig(cameras)(joints).pixels
     points = points + 0.3 * torch.randn(points.shape, generator=generator, dtype=points.dtype)
@@ -95,10 +119,7 @@ def scene(tmp_path_factory):
     write_keypoints(folder / "left.csv", keypoints_of(points[:, 1]))
     write_keypoints(folder / "behind.npz", keypoints_of(points[:, 2]))
     write_keypoints(folder / "front.npz", keypoints_of(points[:, 0]))
-    for name in PLACES:
-        with VideoWriter(folder / f"{name}.mp4", FPS, (WIDTH, HEIGHT)) as writer:
-            for _ in range(N):
-                writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    write_videos(folder)
     np.save(folder / "points.npy", points[:, 0].numpy())
     return folder, joints, points
 
@@ -130,14 +151,7 @@ def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
 
 @pytest.fixture
 def track(torchpose, scene):
-    """The command on files of the scene: track("front_json", ..., "--option") -> Result."""
-    folder = scene[0]
-
-    def run(out, *words):
-        given = [folder / w if isinstance(w, str) and (folder / w).exists() else w for w in words]
-        return torchpose("track-body", folder / "cameras.toml", *given, "--out", out)
-
-    return run
+    return on_files(torchpose, scene[0])
 
 
 MIXED = ("front_json", "left.csv", "behind.npz")

@@ -4,18 +4,26 @@ import numpy as np
 import pytest
 import torch
 
-from tests.cli.test_track_body import HEIGHT, WIDTH, N, arms_rise, looking_at
-from tests.cli.test_track_body_keypoints import DETECTOR, FPS, PLACES, keypoints_of, write_openpose
+from tests.cli.test_track_body import N, arms_rise
+from tests.cli.test_track_body_keypoints import (
+    DETECTOR,
+    FPS,
+    PLACES,
+    PLAIN,
+    keypoints_of,
+    on_files,
+    write_cameras,
+    write_openpose,
+    write_videos,
+)
 from torchpose.body import BODY_15, Body
-from torchpose.camera import CameraRig, save_cameras
+from torchpose.camera import CameraRig
 from torchpose.cli._body_keypoint_inputs import DetectorSettings, read_body_keypoints
 from torchpose.io import read_keypoints, write_keypoints
 from torchpose.io._formats.openpose import read_openpose_people
-from torchpose.video import VideoWriter
 from torchpose.whole_body import BodyTrack
 
 BOTH = ("front_json", "left_json", "behind.npz")
-PLAIN = ("--pictures", "false")
 ENTERS = 2  # frame from which on the second person is there
 
 
@@ -27,41 +35,20 @@ def scene(tmp_path_factory):
     joints = torch.stack([body.joints(arms_rise(body))] * 2, 1)
     joints[:, 0, :, 0] -= 0.5
     joints[:, 1, :, 0] += 0.5
-    cameras = [looking_at(name, place) for name, place in PLACES.items()]
-    save_cameras(cameras, folder / "cameras.toml")
+    cameras = write_cameras(folder)
     pixels = torch.stack([CameraRig(cameras)(joints[:, p]).pixels for p in range(2)], 2)
     pixels[:ENTERS, :, 1] = torch.nan
     for c, name in enumerate(("front", "left")):
         write_openpose(folder / f"{name}_json", *pixels[:, c].movedim(1, 0).numpy())
     write_keypoints(folder / "behind.npz", keypoints_of(pixels[:, 2, 0]))
-    for name in PLACES:
-        with VideoWriter(folder / f"{name}.mp4", FPS, (WIDTH, HEIGHT)) as writer:
-            for _ in range(N):
-                writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    write_videos(folder)
     np.save(folder / "points.npy", pixels[:, 0].numpy())
     return folder, joints, cameras
 
 
 @pytest.fixture
 def track(torchpose, scene):
-    """The command on files of the scene: track(out, "front_json", ..., "--option") -> Result."""
-    folder = scene[0]
-
-    def run(out, *words):
-        given = [folder / w if isinstance(w, str) and (folder / w).exists() else w for w in words]
-        return torchpose(
-            "track-body",
-            folder / "cameras.toml",
-            *given,
-            "--fps",
-            FPS,
-            "--height",
-            1.75,
-            "--out",
-            out,
-        )
-
-    return run
+    return on_files(torchpose, scene[0], "--fps", FPS, "--height", 1.75)
 
 
 def test_all_persons_are_tracked_written_and_drawn(track, scene, tmp_path):
