@@ -16,7 +16,7 @@ Cholesky factors of I + L^T G L.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -54,7 +54,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     squared_errors,
     weigh,
 )
-from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.nested import replaced, taken
 from torchpose.whole_body._keypoints.upright import Upright, upright_of
 
 FEW_INLIERS = 0.7
@@ -91,14 +91,6 @@ class BodyGaussian(NamedTuple):
         """Return what is believed of cameras."""
         return Beliefs(self.log_odds, self.scale)
 
-    def take(self, index: Int[Tensor, " N"]) -> Self:
-        """Return some elements of the batch."""
-        return taken(self, index)
-
-    def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
-        """Return the batch with some elements replaced."""
-        return mapped(lambda own, new: own.index_copy(0, index, new), self, other)
-
 
 class CorrectedBody(NamedTuple):
     """Holds what a correction gives.
@@ -115,14 +107,6 @@ class CorrectedBody(NamedTuple):
     weighed: Weighed
     log_evidence: Tensor
     widened: Tensor
-
-    def take(self, index: Int[Tensor, " N"]) -> Self:
-        """Return some elements of the batch."""
-        return taken(self, index)
-
-    def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
-        """Return the batch with some elements replaced."""
-        return mapped(lambda own, new: own.index_copy(0, index, new), self, other)
 
 
 class _Linearised(NamedTuple):
@@ -259,14 +243,14 @@ class BodyKalmanFilter(nn.Module):
         points the other way.
         """
         widened = (jumped[rows].to(state.cov) @ self.articulation.carriers) * self._jump_variance
-        wide = state.take(rows)
+        wide = taken(state, rows)
         frame = frame.take(rows)
         joints = triangulate(self.maps, frame)
         seen = jumped[rows] & joints.isfinite().all(-1)
         mean = self.articulation.swung(wide.mean, joints.nan_to_num(), seen)
         wide = wide._replace(mean=mean, cov=wide.cov + torch.diag_embed(widened))
         again = self._iterated(wide, readings_of(frame, self.exchange), _RECOVERY)
-        return corrected.put(rows, again._replace(widened=widened))
+        return replaced(corrected, rows, again._replace(widened=widened))
 
     def _iterated(
         self,

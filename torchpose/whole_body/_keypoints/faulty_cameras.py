@@ -29,7 +29,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 from torchpose.whole_body._keypoints.keypoint_start import start
-from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.nested import replaced, taken
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, free_turns, looked_again
 from torchpose.whole_body._keypoints.turned_cameras import (
     angles_of,
@@ -197,9 +197,9 @@ def find_faults(
         looks=looks,
     )
     rows = better.nonzero().squeeze(-1)
-    after = mapped(lambda old, other: old.index_copy(0, rows, other[rows]), faults, new)
+    after = replaced(faults, rows, taken(new, rows))
     after = after._replace(doubted=torch.where(better, 0.0, paused(filter, faults).doubted))
-    return after, known.put(rows, found.take(best[rows])), better
+    return after, replaced(known, rows, taken(found, best[rows])), better
 
 
 def paused(filter: BodyKalmanFilter, faults: CameraFaults) -> CameraFaults:

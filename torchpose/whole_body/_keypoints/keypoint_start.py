@@ -26,6 +26,7 @@ from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.lifted_pose import corrected_by
 from torchpose.whole_body._keypoints.lifting_network import Lifted
+from torchpose.whole_body._keypoints.nested import replaced, taken
 
 _HEADINGS = 8
 _WIDTHS = (
@@ -64,7 +65,7 @@ def start(
     every = torch.arange(len(joints), device=joints.device)
     found = filter.correct(state, frame.take(every.repeat_interleave(n_headings)), _WIDTHS)
     best = every * n_headings + found.log_evidence.view(-1, n_headings).argmax(-1)
-    return _by_wider(filter, frame, state.take(best), found.take(best))
+    return _by_wider(filter, frame, taken(state, best), taken(found, best))
 
 
 def _by_wider(
@@ -80,11 +81,11 @@ def _by_wider(
     rows = ((share < FEW_INLIERS) & several).nonzero().squeeze(-1)
     if not len(rows):
         return found
-    state = state.take(rows)
+    state = taken(state, rows)
     wide = state._replace(scale=_WIDER * state.scale)
     again = filter.correct(wide, frame.take(rows), _WIDTHS)
     better = again.log_evidence > found.log_evidence[rows]
-    return found.put(rows[better], again.take(better.nonzero().squeeze(-1)))
+    return replaced(found, rows[better], taken(again, better.nonzero().squeeze(-1)))
 
 
 def start_of_one(

@@ -53,6 +53,7 @@ from torchpose.whole_body._keypoints.nested import (
     FrameCollector,
     mapped,
     part_of,
+    replaced,
     taken,
     write_part,
 )
@@ -269,8 +270,8 @@ class KeypointTracker(nn.Module):
         explained = anew, self._posed(anew, found, torch.ones_like(better)), found
         kept = stream, pose, before
         chosen = better.nonzero().squeeze(-1)
-        after = mapped(lambda old, new: old.index_copy(0, chosen, new[chosen]), kept, explained)
-        return mapped(lambda old, new: old.index_copy(0, rows, new), step, after)
+        after = replaced(kept, chosen, taken(explained, chosen))
+        return replaced(step, rows, after)
 
     # --- one of several cameras -------------------------------------------------------------------
 
@@ -290,7 +291,7 @@ class KeypointTracker(nn.Module):
                 own = None if begins or before is None else taken(before, rows)
                 if len(rows):
                     after = self._by_camera(camera, own, frame.take(rows), taken(step, rows))
-                    step = mapped(lambda old, new, at=rows: old.index_copy(0, at, new), step, after)
+                    step = replaced(step, rows, after)
         return step
 
     def _by_camera(
@@ -398,7 +399,7 @@ class KeypointTracker(nn.Module):
         """Return what was found, with the persons who are due begun with this frame."""
         persons = due.nonzero().squeeze(-1)
         theirs = None if lifted is None else taken(lifted, persons)
-        return found.put(persons, self._started(frame.take(persons), theirs))
+        return replaced(found, persons, self._started(frame.take(persons), theirs))
 
     def _unsure(
         self,

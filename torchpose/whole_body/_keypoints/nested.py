@@ -28,6 +28,15 @@ def taken(value: Any, index: Tensor) -> Any:
     return mapped(lambda tensor: tensor[index], value)
 
 
+def replaced(value: Any, index: Tensor, other: Any) -> Any:
+    """Return the batch with some elements replaced, of a tensor or of named tuples of tensors.
+
+    Args:
+        value: the batch. index: of the elements [N]. other: what takes their places, [N, ...].
+    """
+    return mapped(lambda own, new: own.index_copy(0, index, new), value, other)
+
+
 def stacked(frames: Sequence[Any]) -> Any:
     """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
     return mapped(lambda *values: torch.stack(values, 1), *frames)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
-from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.nested import mapped, replaced, taken
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns
 
 _FRAMES = 16  # that are kept
@@ -94,7 +94,7 @@ def looked_again(
     if not len(rows):
         return looks, rows, looks.turn[rows, 0]
     some, best = _estimated(taken(looks, rows), frame.take(rows), maps)
-    return mapped(lambda old, new: old.index_copy(0, rows, new), looks, some), rows, best
+    return replaced(looks, rows, some), rows, best
 
 
 def _estimated(
