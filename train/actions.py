@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 
+from torchpose.io._results import ResultsFolder
 from torchpose.learning._fit_files import write_action_files
 from torchpose.learning._recipes import ActionRecipe, Performances, fit_actions
 from torchpose.learning._recipes.actions import FittedActions, check_actions
@@ -87,16 +88,13 @@ class ActionFit(BodyFit):
         found = {"explained": [s.info.explained or 0.0 for s, _ in fitted.spaces.values()]}
         if fitted.accepted:
             found["accepted"] = list(fitted.accepted.values())
-        values = {k: torch.tensor(v).double().mean() for k, v in found.items()}
-        self.log_dict(values, on_step=True)
+        self.log_all({k: float(torch.tensor(v).double().mean()) for k, v in found.items()})
         self.trainer.should_stop = True
 
-    def finished_prior(self, **facts: str) -> None:
-        """Write the action space or bank where a prior's file would be."""
-        if self.results is not None:
-            results, name = self.results
-            picture = bool(self.hparams["picture"])
-            print(write_action_files(self._fit(), results, name, picture, **facts), flush=True)
+    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+        """Write the action space or bank, and its picture."""
+        picture = bool(self.hparams["picture"])
+        return write_action_files(self._fit(), results, file, picture, **facts)
 
     def _fit(self) -> FittedActions:
         if self._fitted is None:  # after a resumed run, too, whose step is not done again

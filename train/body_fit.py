@@ -3,9 +3,10 @@
 The fits themselves are in `torchpose.learning._recipes`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import torch
 from lightning.pytorch import LightningDataModule, LightningModule
 from torch.optim import Optimizer
 
@@ -54,7 +55,8 @@ class BodyData(LightningDataModule):
 class BodyFit(LightningModule):
     """Base of the fits that one process does with an optimiser of its own, or with none.
 
-    A subclass calls `save_hyperparameters` in its constructor, and names its data and what it fits.
+    A subclass calls `save_hyperparameters` in its constructor, names its data and what it fits, and writes
+    its model.
 
     Attributes:
         data_type: the data module that it takes. what: what is fitted, for the refusal of several
@@ -107,13 +109,19 @@ class BodyFit(LightningModule):
     def go_on_from(self, kept: dict[str, Any]) -> None:
         """Restore what `progress_made` returned."""
 
-    @property
-    def results(self) -> tuple[ResultsFolder, str] | None:
-        """Return the folder and name of the prior's file; None in other processes."""
+    def log_all(self, found: Mapping[str, float]) -> None:
+        """Log numbers of this step in double precision."""
+        self.log_dict({k: torch.tensor(float(v)).double() for k, v in found.items()}, on_step=True)
+
+    def finished_prior(self, **facts: str) -> None:
+        """Write the model where a prior's file would be; there is no prior to be calibrated."""
         writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
-        if not writers or not self.trainer.is_global_zero:
-            return None
-        return writers[0].results, writers[0].out.name
+        if writers and self.trainer.is_global_zero:
+            print(self.write(writers[0].results, writers[0].out.name, **facts), flush=True)
+
+    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+        """Write the model's file and its card, and return what to say of it; a subclass does."""
+        raise NotImplementedError
 
     @property
     def data_module(self) -> BodyData:

@@ -2,9 +2,8 @@
 
 from dataclasses import asdict
 
-import torch
-
 from torchpose._core.checks import check_rate
+from torchpose.io._results import ResultsFolder
 from torchpose.learning._body_motion_fit import BodyMotionRecipe
 from torchpose.learning._fit_files import write_body_files
 from torchpose.learning._recipes import RecordedMotion, fit_motion
@@ -84,11 +83,9 @@ class BodyMotionFit(BodyFit):
         found: dict[str, float] = {"frames": sum(len(s.residual) for s in self.gathered.train)}
         if held_out is not None:
             found = {"acceleration": held_out.acceleration, "log_density": held_out.log_density}
-        self.log_dict({k: torch.tensor(v).double() for k, v in found.items()}, on_step=True)
+        self.log_all(found)
         self.trainer.should_stop = True
 
-    def finished_prior(self, **facts: str) -> None:
-        """Write the prior where that of an upper body would be."""
-        if self.results is not None:
-            results, name = self.results
-            print(write_body_files(self.gathered, results, name, self._recipe, **facts), flush=True)
+    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+        """Write the prior."""
+        return write_body_files(self.gathered, results, file, self._recipe, **facts)

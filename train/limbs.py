@@ -1,8 +1,7 @@
 """Fit limb conditionals with Lightning, in one step."""
 
-import torch
-
 from torchpose._core.checks import check_rate
+from torchpose.io._results import ResultsFolder
 from torchpose.learning._fit_files import write_limb_files
 from torchpose.learning._recipes import LimbStates, fit_limbs
 from torchpose.learning._recipes.limbs import check_least_std
@@ -64,12 +63,9 @@ class LimbFit(BodyFit):
         found = {"frames": sum(map(len, self.gathered.train))} if held_out is None else {
             "deviation": held_out.deviation, "speed": held_out.speed,
         }  # fmt: skip
-        self.log_dict({k: torch.tensor(v).double() for k, v in found.items()}, on_step=True)
+        self.log_all(found)
         self.trainer.should_stop = True
 
-    def finished_prior(self, **facts: str) -> None:
-        """Write the conditionals where a prior's file would be."""
-        if self.results is not None:
-            results, name = self.results
-            least = self.settings["least_std"]
-            print(write_limb_files(self.gathered, results, name, least, **facts), flush=True)
+    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+        """Write the conditionals."""
+        return write_limb_files(self.gathered, results, file, self.settings["least_std"], **facts)

@@ -6,9 +6,9 @@ A step is ten iterations of the optimiser over all poses at once. The fit itself
 
 from typing import Any
 
-import torch
 from torch import nn
 
+from torchpose.io._results import ResultsFolder
 from torchpose.learning._fit_files import write_manifold_files
 from torchpose.learning._recipes import ManifoldFitting, ManifoldPoses, ManifoldRecipe
 from torchpose.learning._recipes.manifold import check_gathering
@@ -100,8 +100,7 @@ class ManifoldFit(BodyFit):
 
     def training_step(self, batch: int, batch_idx: int) -> None:
         """Take one step, and log the error on the held-out poses."""
-        found = self.fitting.step()
-        self.log_dict({k: torch.tensor(float(v)).double() for k, v in found.items()}, on_step=True)
+        self.log_all(self.fitting.step())
         if self.fitting.finished:
             self.trainer.should_stop = True
 
@@ -113,9 +112,7 @@ class ManifoldFit(BodyFit):
         """Stop at once if the fit had come to its end."""
         self._stopped = bool(kept["stopped"])
 
-    def finished_prior(self, **facts: str) -> None:
-        """Write the manifold where a prior's file would be; there is no prior to be calibrated."""
-        if self.results is not None:
-            results, name = self.results
-            picture = bool(self.hparams["picture"])
-            print(write_manifold_files(self.fitting, results, name, picture, **facts), flush=True)
+    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+        """Write the manifold, and its picture."""
+        picture = bool(self.hparams["picture"])
+        return write_manifold_files(self.fitting, results, file, picture, **facts)
