@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.data import data_dir_or_skip
+from tests.draws import generator
 from tests.filters.linear_poses import assert_within_error
 from tests.filters.oracles import (
     dense_posterior,
@@ -27,10 +28,6 @@ from torchpose.priors import GaussianMixture
 WIDE = torch.float64
 EXACT_PROPOSALS = ("mixture", "random-walk")
 DTYPES = (torch.float32, torch.float64)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def mixture(weights, means, covs):

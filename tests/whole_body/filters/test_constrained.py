@@ -5,6 +5,7 @@ import warnings
 import pytest
 import torch
 
+from tests.draws import generator
 from tests.filters.linear_poses import LinearBody, assert_within_error
 from tests.whole_body.filters.bending_body import BODY, performance, performances, space
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig
@@ -36,10 +37,6 @@ def motion_noise():
 
 
 RIG = rig(3).select([0, 1])
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def near(target):

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.draws import generator
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.errors import InputError, ShapeError
 from torchpose.whole_body import count_pixels, find_first_pose, render
@@ -14,10 +15,6 @@ from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
 BODY, RIG = walker(), rig()
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 QUICK = {"n_particles": 1000, "n_tracking": 100, "n_frames": 5}
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def ahead(states):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.draws import generator
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, rotation_vector, walk, walker
 from torchpose.body import Limbs
 from torchpose.camera import CameraRig, PinholeCamera
@@ -16,10 +17,6 @@ from torchpose.whole_body._pose_search import (
 from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 BODY, RIG = walker(), rig()
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def pillar(x, y, z, tall=1.7, radius=0.1):

@@ -5,12 +5,9 @@ import math
 import pytest
 import torch
 
+from tests.draws import generator
 from tests.filters.linear_poses import assert_within_error
 from torchpose.whole_body._filters.posture_gate import Rows, redraw_until_accepted
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def normal_below(limit):

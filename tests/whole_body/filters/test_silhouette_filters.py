@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.draws import generator
 from tests.filters.linear_poses import (
     BoxLimits,
     LinearBody,
@@ -34,10 +35,6 @@ RUNS = 48
 
 def tensor(values):
     return torch.tensor(values, dtype=WIDE)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def generators(count, first=0):

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.draws import generator
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import JointLimits
 from torchpose.errors import CameraError, PriorError
@@ -20,10 +21,6 @@ from torchpose.whole_body import (
 from torchpose.whole_body._sharpness import ValidationSequence, mean_joint_error
 
 BODY, RIG = walker(), rig()
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.fixture(scope="module")
