@@ -51,7 +51,6 @@ from torchpose.whole_body._keypoints.lone_camera import (
 )
 from torchpose.whole_body._keypoints.nested import (
     FrameCollector,
-    mapped,
     part_of,
     replaced,
     taken,
