@@ -44,6 +44,23 @@ def test_the_filters_density_is_the_priors(prior):
     )
 
 
+@pytest.mark.parametrize("n_axes", [2, 3])
+def test_forearms_of_few_axes_have_the_density_of_their_directions(prior, n_axes):
+    """Of more upper arms than are computed at a time, with axes of their own or the same for all."""
+    generator = torch.Generator().manual_seed(4)
+    upper = pairs(2 * 120, seed=3)[:, :3].view(2, 120, 3)
+    axes = torch.linalg.qr(torch.randn(2, 120, 3, 3, generator=generator, dtype=DOUBLE)).Q
+    axes = axes[..., :n_axes, :]
+    turns = torch.randn(17, n_axes, generator=generator, dtype=DOUBLE)
+    turns = torch.nn.functional.normalize(turns, dim=-1)
+    density = DirectionDensity(prior)
+    for given in (axes, axes[:, :1]):
+        lower = (turns @ given).expand(2, 120, 17, 3)
+        both = torch.cat([upper[:, :, None].expand_as(lower), lower], -1)
+        found = density.of_arms(upper, given, turns)
+        torch.testing.assert_close(found, density(both), rtol=1e-10, atol=1e-10)
+
+
 def test_it_is_read_as_it_was_written(prior, tmp_path):
     prior.save(tmp_path / "arms.safetensors")
     again = ArmPrior.load(tmp_path / "arms.safetensors")

@@ -16,7 +16,7 @@ from torchpose._core.module_state import outside_inference
 from torchpose.priors._arms import ArmPrior
 from torchpose.priors._gaussian_mixture import LOG_2PI
 from torchpose.upper_body._absence import log_beyond
-from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, sphere_points
+from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray
 from torchpose.upper_body._torso_occlusion import log_in_view
 
 _ANGLES = 17  # of a bone whose end is measured
@@ -30,6 +30,7 @@ _LATER = 0.25
 _RATE = 30.0
 _NOTHING = -45.0  # nats relative to the broad part of the prior
 _LEAST = 1e-30  # density
+_LOG_2 = math.log(2)
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 # Directions, and arms of which all pairs of directions are compared, at a time: so that intermediate
 # results stay in the cache.
@@ -111,8 +112,10 @@ class ArmState(NamedTuple):
 class DirectionDensity:
     """Log-density of an `ArmPrior`; what does not depend on the directions is computed once.
 
-    That of each component is a quadratic polynomial of the six coordinates, so one product gives all. Its
-    terms of the upper arm alone are computed once for all forearms that are tried with it.
+    That of each component is a quadratic polynomial of the six coordinates, so one product gives all. The
+    directions of the forearms that are tried with an upper arm are sums of a few axes, of which the
+    polynomials are computed in place of those of all directions (`of_arms`). Densities are powers of two,
+    which PyTorch computes in half the time of others.
     """
 
     def __init__(self, prior: ArmPrior, device: torch.device | None = None) -> None:
@@ -135,59 +138,86 @@ class DirectionDensity:
         self._second = torch.cat([second, torch.full_like(alone, dim)])
         slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
         log_broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
-        self._broad, self._nothing = math.exp(log_broad), log_broad + _NOTHING
-        self._slopes_of_all = pad(slopes, (0, 1))
-        self._slopes_of_all[-1, -1] = log_broad
-        self._slopes_of_upper, self._slopes_of_lower = _by_bone(-0.5 * precision, pulled, constant)
+        self._broad, self._nothing = math.exp(log_broad), (log_broad + _NOTHING) / _LOG_2
+        self._slopes = pad(slopes, (0, 1))
+        self._slopes[-1, -1] = log_broad
+        self._slopes /= _LOG_2
+        by_bone = _by_bone(-0.5 * precision, pulled, constant)
+        self._forms = {count: _form(*by_bone, count) for count in (2, 3)}
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
 
-    def __call__(
-        self, directions: Float[Tensor, "*batch 6"], lowers: int = 1
-    ) -> Float[Tensor, "*batch"]:
-        """Return log p(d_u, d_f).
-
-        Args:
-            directions: those of upper arms and forearms. lowers: the number of consecutive forearms that
-                have their upper arm in common.
-        """
-        rows = pad(directions.reshape(-1, 6).double(), (0, 1), value=1.0)
-        ends = pad(rows[::lowers, :3], (0, 1), value=1.0)
-        upper = (ends[:, :, None] * ends[:, None]).flatten(1) @ self._slopes_of_upper
-        count, columns = max(1, _ROWS // lowers), rows.mT.contiguous()
-        pairs = zip(upper.split(count), columns.split(count * lowers, 1), strict=True)
-        known = torch.cat([self._known(*pair) for pair in pairs])
-        return (known + self._broad).log().to(directions.dtype).view(directions.shape[:-1])
+    def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
+        """Return log p(d_u, d_f)."""
+        return self._densities(directions).sum(-1).log().to(directions.dtype)
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
-        logs = self._terms(directions.reshape(-1, 6)).mT @ self._slopes_of_all
-        return torch.softmax(logs, -1).to(directions.dtype).view(*directions.shape[:-1], -1)
+        densities = self._densities(directions)
+        return (densities / densities.sum(-1, keepdim=True)).to(directions.dtype)
 
-    def _terms(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "T N"]:
-        """Return the terms of the polynomials that are the log-densities of the components.
+    def of_arms(
+        self,
+        upper: Float[Tensor, "*batch U 3"],
+        axes: Float[Tensor, "*#batch #U A 3"],
+        turns: Float[Tensor, "G A"],
+    ) -> Float[Tensor, "*batch U G"]:
+        """Return log p(d_u, d_f) of each upper arm with G forearms d_f = sum_a t_a e_a.
 
-        They cancel, some of a thousand to a few: they are float64.
-        """
-        columns = pad(rows.double(), (0, 1), value=1.0).mT.contiguous()
-        return columns.index_select(0, self._first) * columns.index_select(0, self._second)
+        A component's polynomial of d_u and d_f is one of (1, t) too, whose coefficients are products of d_u
+        and the axes:
 
-    def _known(
-        self, upper: Float[Tensor, "U K"], columns: Float[Tensor, "7 N"]
-    ) -> Float[Tensor, " N"]:
-        """Return the density of the mixture, without its broad part.
+            log p_k = sum_(i >= j) c_ijk t_i t_j,   t_0 = 1
 
         Args:
-            upper: the polynomials' terms of the upper arms alone.
-            columns: N / U directions for each of these, and ones.
+            upper: d_u. axes: e. turns: t.
         """
-        terms = (columns[3:6, None] * columns).flatten(0, 1)
-        logs = upper.repeat_interleave(columns.shape[1] // len(upper), 0).addmm_(
-            terms.mT, self._slopes_of_lower
+        n_axes, n_uppers = axes.shape[-2], upper.shape[:-1]
+        first, second, slopes = self._forms[n_axes]
+        bones = torch.cat(
+            [
+                pad(upper, (0, 1), value=1.0)[..., None, :],
+                pad(axes, (0, 1)).expand(*n_uppers, n_axes, 4),
+            ],
+            -2,
         )
-        # exp of what is far below the broad part is slow where it is denormal, and adds nothing
-        return logs.clamp_min_(self._nothing).exp_().sum(-1)
+        bones = bones.reshape(-1, n_axes + 1, 4).double().permute(1, 2, 0).contiguous()
+        turns = pad(turns.double(), (1, 0), value=1.0)
+        products = turns[:, first] * turns[:, second]
+        count = max(1, _ROWS // len(turns))
+        pairs = (bones.index_select(0, rows).split(count, 2) for rows in (first, second))
+        known = torch.cat(
+            [self._known(*pair, slopes, products).mT for pair in zip(*pairs, strict=True)]
+        )
+        return (known + self._broad).log().to(upper.dtype).view(*n_uppers, -1)
+
+    def _known(
+        self,
+        one: Float[Tensor, "P 4 N"],
+        other: Float[Tensor, "P 4 N"],
+        slopes: Float[Tensor, "P 16 K"],
+        products: Float[Tensor, "G P"],
+    ) -> Float[Tensor, "G N"]:
+        """Return the density of the mixture at N upper arms with G forearms, without its broad part."""
+        of_pairs = torch.bmm((one[:, :, None] * other[:, None]).flatten(1, 2).mT, slopes)
+        densities = self._powers(products @ of_pairs.flatten(1))
+        return densities.view(len(products), -1, slopes.shape[-1]).sum(-1)
+
+    def _densities(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
+        """Return the densities of the components, the broad one last.
+
+        The terms of their logarithms cancel, some of a thousand to a few: they are float64.
+        """
+        rows = directions.reshape(-1, 6)
+        columns = pad(rows.double(), (0, 1), value=1.0).mT.contiguous()
+        terms = columns.index_select(0, self._first) * columns.index_select(0, self._second)
+        return self._powers(terms.mT @ self._slopes).view(*directions.shape[:-1], -1)
+
+    def _powers(self, logs: Tensor) -> Tensor:
+        """Return two to the power of numbers, in place."""
+        # what is far below the broad part adds nothing, and is slow where its power is denormal
+        return logs.clamp_min_(self._nothing).exp2_()
 
 
 class ArmChain:
@@ -266,7 +296,8 @@ class ArmChain:
             std = variance[..., 0].sqrt()
             upper = nodes_on_ray(shoulder, rays[..., 0, :], lengths[..., 0], std, sizes[0])
         else:  # the elbow is known as well as its directions are dense
-            upper = nodes_anywhere(shoulder, lengths[..., 0], meant(_sphere(arm.axes, sizes[0])))
+            axes = meant(_axes_of_spheres(arm.axes))
+            upper = nodes_anywhere(shoulder, lengths[..., 0], axes, sizes[0])
             grain = (4 * math.pi / sizes[0] / 12) * lengths[..., :1].square()
             variance = variance + grain
         start, length = upper.ends, lengths[..., 1, None]
@@ -274,11 +305,8 @@ class ArmChain:
             std = variance[..., 1, None].sqrt()
             lower = nodes_on_ray(start, rays[..., None, 1, :], length, std, sizes[1])
         else:
-            sphere = meant(_sphere(arm.axes, sizes[1]))
-            lower = nodes_anywhere(start, length, sphere[..., None, :, :])
-        shape = *start.shape[:-1], sizes[1], 3
-        bones = upper.directions[..., None, :], lower.directions
-        directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
+            axes = meant(_axes_of_spheres(arm.axes))[..., None, :, :]
+            lower = nodes_anywhere(start, length, axes, sizes[1])
         weight = upper.log_weight[..., None] + lower.log_weight
         if not hand and arm.borders is not None and arm.log_inside is not None:
             borders, log_inside = meant(arm.borders)[..., None, :, :], meant(arm.log_inside)
@@ -291,11 +319,16 @@ class ArmChain:
             of_elbow, of_hand = in_view.tensor_split(sizes[:1], -1)
             weight = weight + of_elbow[..., None] + of_hand.view(weight.shape)
         weight = weight.flatten(-2)
-        prior = self.density(directions, sizes[1])
+        uppers = upper.directions.expand_as(start)
+        prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
+        shape = *start.shape[:-1], sizes[1], 3
+        bones = uppers[..., None, :], lower.directions
         if weight.shape[-1] <= count:
+            directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
             return Arms(directions, weight, prior)
         best = (weight + prior).topk(count, -1).indices
-        return Arms(_rows_of(directions, best), weight.gather(-1, best), prior.gather(-1, best))
+        chosen = [_rows_of(bone.expand(shape).flatten(-3, -2), best) for bone in bones]
+        return Arms(torch.cat(chosen, -1), weight.gather(-1, best), prior.gather(-1, best))
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -432,15 +465,33 @@ class ArmChain:
 
 def _by_bone(
     square: Float[Tensor, "K 6 6"], linear: Float[Tensor, "K 6"], constant: Float[Tensor, " K"]
-) -> tuple[Float[Tensor, "16 K"], Float[Tensor, "21 K"]]:
+) -> tuple[Float[Tensor, "16 K"], Float[Tensor, "16 K"], Float[Tensor, "16 K"]]:
     """Return the coefficients of quadratic polynomials of the directions u and f of both bones.
 
-    They are those of the products of (u, 1) with itself, and of f with (u, f, 1).
+    They are those of the products of (u, 1) with itself, of (f, 0) with (u, 1), and of (f, 0) with itself,
+    of logarithms to base two.
     """
     upper = pad(square[:, :3, :3], (0, 1, 0, 1))
     upper[:, :3, 3], upper[:, 3, 3] = linear[:, :3], constant
-    lower = torch.cat([2 * square[:, 3:, :3], square[:, 3:, 3:], linear[:, 3:, None]], -1)
-    return upper.flatten(1).mT.contiguous(), lower.flatten(1).mT.contiguous()
+    across = pad(torch.cat([2 * square[:, 3:, :3], linear[:, 3:, None]], -1), (0, 0, 0, 1))
+    lower = pad(square[:, 3:, 3:], (0, 1, 0, 1))
+    upper, across, lower = (part.flatten(1).mT / _LOG_2 for part in (upper, across, lower))
+    return upper, across, lower
+
+
+def _form(
+    upper: Float[Tensor, "16 K"],
+    across: Float[Tensor, "16 K"],
+    lower: Float[Tensor, "16 K"],
+    n_axes: int,
+) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, "P 16 K"]]:
+    """Return the pairs (i, j) of (u, 1) and the axes of f, and the coefficients of their products."""
+    first, second = torch.tril_indices(n_axes + 1, n_axes + 1, device=upper.device)
+    slopes = []
+    for i, j in zip(first.tolist(), second.tolist(), strict=True):
+        of_axes = lower if i == j else 2 * lower  # either order of two axes counts
+        slopes.append(upper if i == 0 else across if j == 0 else of_axes)
+    return first, second, torch.stack(slopes)
 
 
 def _given_later(state: ArmState, message: Float[Tensor, "B 2 N"]) -> ArmState:
@@ -460,29 +511,18 @@ def _belief(
 
 
 def _rows_of(
-    directions: Float[Tensor, "*batch N 6"], rows: Int[Tensor, "*batch K"]
-) -> Float[Tensor, "*batch K 6"]:
+    directions: Float[Tensor, "*batch N D"], rows: Int[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch K D"]:
     """Return some directions of each batch element; whole rows are taken faster than by `gather`."""
-    n = directions.shape[-2]
-    flat = directions.reshape(-1, 6)
+    n, size = directions.shape[-2:]
+    flat = directions.reshape(-1, size)
     start = torch.arange(0, len(flat), n, device=rows.device).view(*rows.shape[:-1], 1)
-    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, 6)
+    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, size)
 
 
-def _sphere(axes: Float[Tensor, "B M 3 3"], n_points: int) -> Float[Tensor, "B 2 M G 3"]:
-    """Return directions spread evenly, those of right arms mirrored, in upright axes."""
-    points = _both_spheres(n_points, axes.dtype, axes.device)
-    return mirrored(points @ axes.mT[:, None])
-
-
-@cache
-def _both_spheres(
-    n_points: int, dtype: torch.dtype, device: torch.device
-) -> Float[Tensor, "2 1 G 3"]:
-    """Return directions spread evenly for left arms, and their mirror images."""
-    with outside_inference():
-        points = sphere_points(n_points).to(device, dtype)
-        return mirrored(points.expand(1, 2, 1, -1, -1))[0]
+def _axes_of_spheres(axes: Float[Tensor, "B M 3 3"]) -> Float[Tensor, "B 2 M 3 3"]:
+    """Return the camera's axes in upright ones, for left arms and for right arms of the mirror image."""
+    return mirrored(mirrored(axes[:, None].expand(-1, 2, -1, -1, -1)).mT)
 
 
 def mirrored(vectors: Float[Tensor, "B 2 *batch 3"]) -> Float[Tensor, "B 2 *batch 3"]:

@@ -21,15 +21,26 @@ class LimbNodes(NamedTuple):
 
     Attributes:
         start: the near end of the limb, [..., 3]. length: its length, [...].
-        directions: unit vectors from there to the far end, [..., G, 3].
+        axes, turns: e and t of the unit vectors sum_a t_a e_a from there to the far end, [..., A, 3] and
+            [G, A].
         log_weight: the log of the likelihood of the pixel times the node's share of the sphere of
             directions, [..., G]. A sum over nodes, times a density over directions, is its integral.
     """
 
     start: Tensor
     length: Tensor
-    directions: Tensor
+    axes: Tensor
+    turns: Tensor
     log_weight: Tensor
+
+    @property
+    def directions(self) -> Float[Tensor, "*batch G 3"]:
+        """Return the unit vectors from the near end to the far end."""
+        turns, (first, *others) = self.turns[..., None], self.axes[..., None, :].unbind(-3)
+        total = turns[:, 0] * first
+        for axis, turn in zip(others, turns.unbind(1)[1:], strict=True):
+            total = torch.addcmul(total, axis, turn)
+        return total
 
     @property
     def ends(self) -> Float[Tensor, "*batch G 3"]:
@@ -63,41 +74,46 @@ def nodes_on_ray(
     along = normalize(ray, dim=-1)
     across = (start * along).sum(-1, keepdim=True) * along - start
     rho = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
-    cos, sin = _even_angles(n_nodes, start.dtype, start.device)
-    inward = across / rho.clamp_min(1e-6)
-    directions = torch.addcmul(along[..., None, :] * sin, inward[..., None, :], cos)
-    off = (rho - length[..., None] * cos[:, 0]) / std[..., None]
+    turns = _even_angles(n_nodes, start.dtype, start.device)
+    off = (rho - length[..., None] * turns[:, 1]) / std[..., None]
     step = math.log(math.radians(2 * _STEEPEST / (n_nodes - 1)))
     constant = step - 0.5 * math.log(2 * math.pi) - (std * length).log()
     log_weight = constant[..., None].sub(off.square(), alpha=0.5)
-    return LimbNodes(start, length, directions, log_weight)
+    axes = torch.stack([along.expand_as(across), across / rho.clamp_min(1e-6)], -2)
+    return LimbNodes(start, length, axes, turns, log_weight)
 
 
 def nodes_anywhere(
     start: Float[Tensor, "*batch 3"],
     length: Float[Tensor, "*#batch"],
-    directions: Float[Tensor, "*#batch G 3"],
+    axes: Float[Tensor, "*#batch 3 3"],
+    n_nodes: int,
 ) -> LimbNodes:
     """Return nodes over the sphere of directions, for a limb whose end is not measured.
 
     Args:
-        start: the near end of the limb, metres. length: L. directions: unit vectors spread evenly
-            (`sphere_points`).
+        start: the near end of the limb, metres. length: L. axes: three at right angles, of length one, in
+            which the points of the sphere are. n_nodes: G.
     """
-    n_nodes = directions.shape[-2]
     weight = start.new_full((), math.log(4 * math.pi / n_nodes))
-    return LimbNodes(start, length, directions, weight.expand(*start.shape[:-1], n_nodes))
+    points = _kept_sphere(n_nodes, start.dtype, start.device)
+    return LimbNodes(start, length, axes, points, weight.expand(*start.shape[:-1], n_nodes))
 
 
 @cache
-def _even_angles(
-    n_nodes: int, dtype: torch.dtype, device: torch.device
-) -> tuple[Float[Tensor, "G 1"], Float[Tensor, "G 1"]]:
-    """Return cosine and sine of the angles phi of nodes on a ray."""
+def _even_angles(n_nodes: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "G 2"]:
+    """Return sine and cosine of the angles phi of nodes on a ray."""
     with outside_inference():
         angles = torch.linspace(-_STEEPEST, _STEEPEST, n_nodes, dtype=dtype, device=device)
-        phi = torch.deg2rad(angles)[:, None]
-        return phi.cos(), phi.sin()
+        phi = torch.deg2rad(angles)
+        return torch.stack([phi.sin(), phi.cos()], -1)
+
+
+@cache
+def _kept_sphere(n_nodes: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "G 3"]:
+    """Return `sphere_points` on a device."""
+    with outside_inference():
+        return sphere_points(n_nodes).to(device, dtype)
 
 
 def sphere_points(n_points: int) -> Float[Tensor, "G 3"]:
