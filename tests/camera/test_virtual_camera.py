@@ -106,6 +106,19 @@ def test_the_last_frame_needs_only_the_last_second():
     torch.testing.assert_close(last.at(4)[1][:, 0], whole.at(4)[1][:, -1])
 
 
+def test_weights_that_a_regression_keeps_are_those_of_its_frames():
+    """Live frames ask again for the weights of the same pattern, which a gap changes and changes back."""
+    uv, mask = scene()
+    known = body_view.path_regression((0, 4), 0, 30.0, MODEL, uv)
+    complete, gap = torch.ones_like(mask), torch.ones_like(mask)
+    gap[:, -3, 3:5] = False
+    for patterns in (complete, gap, gap, complete):
+        given = uv[:, -31:], patterns[:, -31:], (0, 4), 0, 30.0, MODEL, 30
+        kept, anew = body_path(*given, regression=known), body_path(*given)
+        torch.testing.assert_close(kept.neck, anew.neck, rtol=0, atol=0)
+        torch.testing.assert_close(kept.height, anew.height, rtol=0, atol=0)
+
+
 def test_without_head_and_neck_the_path_is_the_usual_place():
     uv, mask = scene()
     path = body_path(uv, torch.zeros_like(mask), (0, 4), 0, 30.0, MODEL)

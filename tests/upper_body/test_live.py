@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from torchpose.camera._virtual_camera import Regression
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.priors import load_prior
@@ -83,6 +84,25 @@ def test_steps_are_the_frames_of_forward(prior, keypoints, few, method, uncertai
     track = tracker(keypoints, confidence, NAMES, mask, generators[0])
     _, poses = stream(tracker, keypoints, generators[1], confidence, mask)
     check_equal(poses, track)
+
+
+def test_noise_that_stays_is_computed_with_once(prior, few, monkeypatch):
+    """Weights of the last second are those of the frame before; a confidence changes all that follow."""
+    tracker, computed = UpperBodyTracker(prior, demo_camera(), method="window-mixture"), []
+    weights = Regression.weights
+
+    def counted(self, known, more):
+        computed.append(len(known))
+        return weights(self, known, more)
+
+    frames = few[:, :1].expand(-1, 36, -1, -1).nan_to_num(250.0)
+    sure = torch.ones(frames.shape[:3], dtype=torch.float64)
+    sure[:, 34] = 0.5
+    whole = tracker(frames, sure, NAMES)
+    monkeypatch.setattr(Regression, "weights", counted)
+    _, poses = stream(tracker, frames, confidence=sure)
+    check_equal(poses, whole)
+    assert computed == [1] * 31 + [3] * 2
 
 
 @pytest.mark.parametrize("options", [{}, {"method": "mkf-fixed"}, {"method": "mkf-sampled"}])

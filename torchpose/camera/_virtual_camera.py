@@ -155,10 +155,15 @@ def memory_frames(lags: tuple[int, ...], fps: float) -> int:
 
 
 class Regression(NamedTuple):
-    """Holds the covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
+    """Holds the covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N].
+
+    Attributes:
+        kept: the weights of the latest pattern that all frames had, which those of live streams have again.
+    """
 
     measured: Tensor
     wanted: Tensor
+    kept: dict[tuple[bool, ...], Tensor]
 
     def of_frames(
         self, known: Bool[Tensor, "B T N"], more: Float[Tensor, "B T N"], alike: bool
@@ -174,8 +179,17 @@ class Regression(NamedTuple):
                 0, known.shape[:2]
             )
         patterns, row = _distinct(known.flatten(0, 1))
-        weights = self.weights(patterns, torch.zeros_like(patterns, dtype=more.dtype))
-        return weights[None] if len(patterns) == 1 else weights[row].unflatten(0, known.shape[:2])
+        usual = torch.zeros_like(patterns, dtype=more.dtype)
+        if row is not None:
+            return self.weights(patterns, usual)[row].unflatten(0, known.shape[:2])
+        key = tuple(patterns[0].tolist())
+        weights = self.kept.get(key)
+        if weights is None:
+            with outside_inference():
+                weights = self.weights(patterns, usual)
+            self.kept.clear()
+            self.kept[key] = weights
+        return weights[None]
 
     def weights(
         self, known: Bool[Tensor, "P N"], more: Float[Tensor, "P N"]
@@ -207,7 +221,7 @@ def path_regression(
     measured = neck[of_frame[:, None], of_frame] + torch.diag(noise.repeat(n))
     measured = measured + height[of_frame[:, None], of_frame] * is_head * is_head[:, None]
     wanted = torch.cat([neck[n:, of_frame], height[n:, of_frame] * is_head])
-    return Regression(measured, wanted)
+    return Regression(measured, wanted, {})
 
 
 def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Tensor:
@@ -219,10 +233,10 @@ def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Te
     return spread**2 + speed**2 * since[:, None] * since + acceleration**2 * walk
 
 
-def _distinct(patterns: Bool[Tensor, "F N"]) -> tuple[Bool[Tensor, "P N"], Tensor]:
-    """Return the distinct rows, and the index of each row among them."""
+def _distinct(patterns: Bool[Tensor, "F N"]) -> tuple[Bool[Tensor, "P N"], Tensor | None]:
+    """Return the distinct rows, and the index of each row among them; None if all rows are the same."""
     if bool((patterns == patterns[:1]).all()):
-        return patterns[:1], torch.zeros(len(patterns), dtype=torch.long, device=patterns.device)
+        return patterns[:1], None
     pieces = patterns.split(62, 1)  # as many bits as fit into a whole number
     codes = [(p * 2 ** torch.arange(p.shape[1], device=p.device)).sum(1) for p in pieces]
     distinct, row = torch.unique(torch.stack(codes, 1), dim=0, return_inverse=True)

@@ -59,7 +59,8 @@ class WindowState(NamedTuple):
 
     Attributes:
         recent: the eight joints of the last frames, at most N, in the prior's pixels, the latest last,
-            with R of each frame [B, N, 8, 2, 2]. joints: the joints that each arm's filter measures.
+            with R of each frame [B, N, 8, 2, 2], or of all [8, 2, 2].
+        joints: the joints that each arm's filter measures.
     """
 
     recent: MeasuredJoints
@@ -294,19 +295,25 @@ class WindowMixture(Estimator):
 
 
 def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
-    """Return the last frames, and the new ones after them; before the first frame the new ones alone."""
+    """Return the last frames, and the new ones after them; before the first frame the new ones alone.
+
+    R is that of each joint in each frame, or [8, 2, 2] where it is the same one in all of them.
+    """
     if frames.uv.shape[1] == 0:
         return MeasuredJoints(*new[:3])
-    pairs = zip(frames[:3], (new.uv, new.mask, _cov_of_frames(new)), strict=True)
-    uv, mask, covs = (torch.cat([old, latest], 1) for old, latest in pairs)
+    uv, mask = (
+        torch.cat([old, latest], 1) for old, latest in zip(frames[:2], new[:2], strict=True)
+    )
+    if new.cov is frames.cov:
+        return MeasuredJoints(uv, mask, new.cov)
+    covs = torch.cat([_cov_of_frames(frames), _cov_of_frames(new)], 1)
     return MeasuredJoints(uv, mask, covs)
 
 
 def _last(frames: MeasuredJoints, count: int) -> MeasuredJoints:
-    """Return the last frames, at most `count`, with R of each."""
-    return MeasuredJoints(
-        frames.uv[:, -count:], frames.mask[:, -count:], _cov_of_frames(frames)[:, -count:]
-    )
+    """Return the last frames, at most `count`."""
+    cov = frames.cov if frames.cov.ndim == 3 else frames.cov[:, -count:]
+    return MeasuredJoints(frames.uv[:, -count:], frames.mask[:, -count:], cov)
 
 
 def _cov_of_frames(measured: MeasuredJoints) -> Float[Tensor, "B T 8 2 2"]:
