@@ -73,10 +73,11 @@ class RootGrid:
         near = (1 - (rows[:, None] - rows[::_EVERY]).abs()).clamp_min(0.0)
         self._between = near / near.sum(1, keepdim=True)
         self._sides = torch.arange(2, device=like.device)[:, None]
-        self._spread = (
-            _share_that_moves(_SPEED / math.sqrt(fps), _DEPTH_STEP),
-            _share_that_moves(_TURN_SPEED / math.sqrt(fps), _TURN_STEP),
-        )
+        self._along = _share_that_moves(_SPEED / math.sqrt(fps), _DEPTH_STEP)
+        share = _share_that_moves(_TURN_SPEED / math.sqrt(fps), _TURN_STEP)
+        stays = torch.eye(n_turns).to(like)
+        beside = stays.roll(1, 0) + stays.roll(-1, 0)
+        self._round = (1 - _LOST) * ((1 - 2 * share) * stays + share * beside)
 
     def init(self, batch_size: int, spread: Float[Tensor, ""]) -> Float[Tensor, "B S Z P"]:
         """Return the belief before the first frame.
@@ -93,11 +94,7 @@ class RootGrid:
 
         The size stays; a share of 1e-6 of the belief restarts from the prior over depth and turn.
         """
-        along, round_ = self._spread
-        moved = _diffused(belief, along)
-        beside = moved.roll(1, -1) + moved.roll(-1, -1)
-        stays = (1 - _LOST) * (1 - 2 * round_)
-        moved = torch.add(stays * moved, beside, alpha=(1 - _LOST) * round_)
+        moved = _diffused(belief, self._along) @ self._round
         anew = belief.sum((-2, -1), keepdim=True)
         return torch.addcmul(moved, anew, self.prior, value=_LOST)
 
