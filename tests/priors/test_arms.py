@@ -10,7 +10,8 @@ from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
 from torchpose.priors import GaussianMixture
 from torchpose.priors._arms import _KIND, LENGTHS, ArmPrior, shipped_arm_prior
 from torchpose.priors._gaussian_mixture import component_log_density
-from torchpose.upper_body._arm_chain import ArmChain, Arms, DirectionDensity
+from torchpose.upper_body._arm_chain import ArmChain, Arms
+from torchpose.upper_body._direction_density import DirectionDensity
 from torchpose.upper_body._limb_nodes import nodes_on_ray, sphere_points
 
 DOUBLE = torch.float64

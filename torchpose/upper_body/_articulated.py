@@ -21,7 +21,7 @@ from torchpose._core.module_state import derived
 from torchpose.errors import InputError
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._arm_chain import ArmChain, ArmState, DirectionDensity
+from torchpose.upper_body._arm_chain import ArmChain, ArmState
 from torchpose.upper_body._articulated_frame import (
     Facts,
     Optics,
@@ -37,6 +37,7 @@ from torchpose.upper_body._articulated_poses import FramePose, SeenBody, estimat
 from torchpose.upper_body._articulated_root import Roots, RootStep, covs_of_roots
 from torchpose.upper_body._articulated_torso import shoulder_places, torso_joints
 from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths, Sizes
+from torchpose.upper_body._direction_density import DirectionDensity
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,
