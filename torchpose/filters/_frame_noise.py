@@ -184,18 +184,23 @@ def own_moments(
     moves = (solved.transpose(-3, -2) @ rows).transpose(-3, -2)
     means = centres[..., None, :, :] + moves
     columns = medians.flatten()
-    padded = parts.padded.to(model.dtype)
-    explained, of_each = _explained(padded, frames.factor, frames.mask, weights, columns)
+    if of_points:
+        given = rows, frames.factor, frames.mask, weights, columns
+        explained, of_each = _explained_of_points(*given)
+    else:
+        padded = parts.padded.to(model.dtype)
+        explained, of_each = _explained(padded, frames.factor, frames.mask, weights, columns)
     if len(medians):
         prior = variances_of(parts.covs, of_points)[..., None, :, columns].to(rows)
         variances = (prior - of_each).unflatten(-1, medians.shape)
         mean = with_medians(mean, weights, means[..., medians], variances, medians)
     if not return_cov:
         return mean, None
+    prior, moved = mixed(weights, parts.covs), between(weights, means, mean)
+    if of_points:
+        return mean, prior + (point_blocks(moved) - explained)
     dim = rows.shape[-1]
-    moved = between(weights, means, mean) - explained[..., :dim, :dim]
-    prior = mixed(weights, parts.covs)
-    return mean, prior + (point_blocks(moved) if of_points else moved)
+    return mean, prior + (moved - explained[..., :dim, :dim])
 
 
 def variances_of(covs: Tensor, of_points: bool) -> Tensor:
@@ -265,3 +270,41 @@ def _explained(
         white.mul_(share[:, None, None])
         torch.mm(flat.T, flat, out=out)
     return total, torch.stack(found)
+
+
+def _explained_of_points(
+    rows: Float[Tensor, "*A K Z D"],
+    factor: Float[Tensor, "*A N K Z Z"],
+    mask: Bool[Tensor, "*A N Z"],
+    weights: Float[Tensor, "*A N K"],
+    columns: Int[Tensor, " C"],
+) -> tuple[Float[Tensor, "*A N P 3 3"], Float[Tensor, "*A N K C"]]:
+    """Return what `_explained` does, of the first alone the blocks of each three consecutive dimensions."""
+    if not values_visible() or wants_gradient(factor, rows, weights):
+        return _points_of_frame(rows[..., None, :, :, :], factor, mask, weights, columns)
+    # One frame at a time stays in the cache.
+    n_frames, frames = weights.shape[-2], weights.shape[:-1]
+    own = (part for part in rows.reshape(-1, *rows.shape[-3:]) for _ in range(n_frames))
+    each = zip(own, factor.flatten(0, -4), mask.flatten(0, -2), weights.flatten(0, -2), strict=True)
+    found = zip(*(_points_of_frame(*frame, columns) for frame in each), strict=True)
+    blocks, of_each = (torch.stack(parts).unflatten(0, frames) for parts in found)
+    return blocks, of_each
+
+
+def _points_of_frame(
+    rows: Float[Tensor, "*#batch K Z D"],
+    factor: Float[Tensor, "*batch K Z Z"],
+    mask: Bool[Tensor, "*batch Z"],
+    weights: Float[Tensor, "*batch K"],
+    columns: Int[Tensor, " C"],
+) -> tuple[Float[Tensor, "*batch P 3 3"], Float[Tensor, "*batch K C"]]:
+    """Return both results of `_explained_of_points`, of any number of frames."""
+    seen = (rows * mask[..., None, :, None]).mT
+    points = torch.linalg.solve_triangular(factor.mT, seen, upper=True, left=False)
+    points = points.unflatten(-2, (-1, 3))  # W^T, [*batch, K, P, 3, Z]
+    squares = points.square().sum(-1)
+    crossed = (points * points.roll(-1, -2)).sum(-1)  # x y, y z, z x
+    products = torch.cat([squares, crossed], -1).flatten(-2)
+    total = (weights[..., None, :] @ products)[..., 0, :].unflatten(-1, (-1, 6))
+    blocks = total[..., [0, 3, 5, 3, 1, 4, 5, 4, 2]].unflatten(-1, (3, 3))
+    return blocks, squares.flatten(-2)[..., columns]
