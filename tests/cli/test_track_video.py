@@ -103,7 +103,19 @@ def test_a_video_without_a_face_has_no_poses(track, tmp_path):
     done, out = track(grey)
     assert done.code == 1
     assert "no face was seen for half a second or longer in the 20 frames (0.67 s)" in done.err
-    assert not list(out.iterdir())
+    assert not list(out.iterdir()) and "turned" not in done.out
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_a_video_on_its_side_is_said_to_be(clip, track, tmp_path, turns):
+    side = tmp_path / "side.mp4"
+    with open_video(clip[0]) as source:
+        size = source.size if turns == 2 else source.size[::-1]
+        with VideoWriter(side, 30.0, size) as writer:
+            for frame in source:
+                writer.write(np.ascontiguousarray(np.rot90(frame.image, turns)))
+    done, _ = track(side, "--overlay", "false")
+    assert f"turned by {90 * turns} degrees clockwise: turn it" in done.out
 
 
 def test_several_persons_and_then_one(clip, track, tmp_path):

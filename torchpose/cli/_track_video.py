@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torchpose.video._video_tracker import VideoTracker
 
 _OVERLAY = "overlay.mp4"
+_THROUGHOUT = 0.9  # share of the frames in which a face is seen that nobody doubts
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
 
 
@@ -66,6 +67,8 @@ def track_video(
                 people, n_frames = _track_camera(tracker, source, results.stage, overlay)
             seconds = time.perf_counter() - start
         notes += tuple(source.notes)  # some of them are known once it is closed
+        if source.reopenable and options["detector"] is None:
+            notes += _note_on_turn(source, people, n_frames)
         if not people:
             detector = options["detector"]
             return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
@@ -95,6 +98,24 @@ def track_video(
             written += results.commit(shown)
     print(_summary(people, names, written, facts, results.notes))
     return max(report_failure(person.track) for person in people)
+
+
+def _note_on_turn(
+    source: "VideoSource", people: list["TrackedPerson"], n_frames: int
+) -> tuple[str, ...]:
+    """Return a note if the video lies on its side, which is looked at where no face is seen throughout."""
+    from torchpose.video._turned import turn_to_upright
+
+    head = [int(p.track.observed[0, :, p.track.names.index("head")].sum()) for p in people]
+    if max(head, default=0) >= _THROUGHOUT * n_frames:
+        return ()
+    with source.reopen() as again:
+        turn = turn_to_upright(again)
+    if not turn:
+        return ()
+    return (
+        f"faces are upright if the video is turned by {turn} degrees clockwise: turn it, and track it again",
+    )
 
 
 def _pictures_of(person: "TrackedPerson", out: Path, wanted: bool) -> list[Path]:
