@@ -286,3 +286,37 @@ def test_small_faces_are_not_searched_for_while_a_larger_one_is_known():
     _, _, detector = follow([face] * 24, every=2, whole_every=10)
     whole = [r for r in detector.asked if r is None or (r.right, r.bottom) == (640, 480)]
     assert whole == [None] * 3
+
+
+def test_a_face_that_comes_after_far_smaller_patterns_is_found_and_takes_their_place():
+    patterns, face = [[500.0, 100, 15], [500, 200, 14]], [200.0, 200, 120]
+
+    def detector(image, region=None):
+        if image.shape == (480, 640) and region is None:
+            found = [face] if image[0, 0] >= 8 else []
+        elif image.shape == (480, 640):
+            found = patterns
+        else:  # about a known face, scaled
+            found = [[image.shape[1] / 2, image.shape[0] / 2, 80.0]]
+        return torch.tensor(found, dtype=torch.float64).reshape(-1, 3)
+
+    tracker = FaceTracker(detector)
+    state = tracker.init()
+    used = []
+    for t in range(30):
+        state = tracker.step(state, np.full((480, 640), t, np.uint8))
+        used.append(state.mean[tracker.usable(state), 2].tolist())
+    assert used[7] == pytest.approx([15, 14], abs=2)  # nobody else is known
+    assert used[-1] == pytest.approx([120], abs=2)
+
+
+def test_somebody_who_walks_away_from_another_is_still_used():
+    tracker = FaceTracker(nobody)
+    state = tracker.init()
+    for t in range(90):
+        size = 60 * 0.985**t
+        found = torch.tensor([[150.0, 200, 120], [450.0, 100, size]], dtype=torch.float64)
+        state = tracker.update(tracker._predict(state), found)
+    assert size < 0.3 * 120
+    used = state.mean[tracker.usable(state), 2]
+    assert used.tolist() == pytest.approx([120.0, size], rel=0.05)

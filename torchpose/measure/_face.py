@@ -22,15 +22,15 @@ from torchpose.measure._face_detector import (
     resized,
     scaled_back,
 )
+from torchpose.measure._face_patterns import far_smaller, on_somebody
 
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
 _USUAL = 40.0  # size above which faces are searched for first, pixels
+_SEARCHES_FOR_LARGER = 3  # of `search_every`, while small faces alone are known
 _LEAST = 4.0  # size below which a track ends: it was lost while it became smaller, pixels
 _TILT = 25.0  # degrees by which an image is turned to find tilted faces
-# Where a far smaller face is a pattern on somebody's head or clothes, in sizes of that person's face.
-_SMALLER_BY, _BESIDE, _ABOVE, _BELOW = 0.7, 0.8, 0.8, 3.0
 
 
 class FaceTracks(NamedTuple):
@@ -39,7 +39,7 @@ class FaceTracks(NamedTuple):
     Attributes:
         mean: (x, y, size) and their velocities per frame [N, 6], pixels. cov: [N, 6, 6].
         hits: detections so far less misses, bounded [N]. age: frames since the first detection [N].
-        unseen: frames since it was last detected [N].
+        unseen: frames since it was last detected [N]. largest: size that it has had, pixels [N].
         identity: number of each face [N]; a number is never used twice. frame: frames seen.
         next_identity: of the next face.
     """
@@ -49,6 +49,7 @@ class FaceTracks(NamedTuple):
     hits: Float[Tensor, " N"]
     age: Int[Tensor, " N"]
     unseen: Int[Tensor, " N"]
+    largest: Float[Tensor, " N"]
     identity: Int[Tensor, " N"]
     frame: int
     next_identity: int
@@ -69,7 +70,8 @@ class FaceTracker(nn.Module):
         detector: by default `HaarFaceDetector`.
         every: search for known faces in every n-th frame, in the region about them; while no track is
             used yet, in every frame.
-        whole_every: search the whole image for new faces in every n-th frame.
+        whole_every: search the whole image for new faces in every n-th frame. While faces of at most 40
+            pixels alone are used, three times `search_every` takes its place if that is less.
         search_every: the same while no track is used.
         gate: largest distance. min_hits: detections before a track is used.
         memory: most hits of a track; it lasts for three times as many misses.
@@ -137,21 +139,32 @@ class FaceTracker(nn.Module):
         """Return the state without faces."""
         real, whole = self.matrix.new_zeros(0), torch.zeros(0, dtype=torch.long)
         return FaceTracks(
-            real.view(0, 6), real.view(0, 6, 6), real, whole, whole.clone(), whole.clone(), 0, 0
-        )
+            real.view(0, 6), real.view(0, 6, 6), real, whole, whole.clone(), real.clone(),
+            whole.clone(), 0, 0,
+        )  # fmt: skip
 
     def usable(self, tracks: FaceTracks) -> Bool[Tensor, " N"]:
-        """Return which tracks have enough detections to be used, and are no pattern on another person."""
+        """Return which tracks have enough detections to be used, and are no pattern beside another person."""
         enough = tracks.hits >= self.min_hits
-        return enough & ~_on_somebody(tracks.mean[:, :3], enough)
+        used = enough & ~on_somebody(tracks.mean[:, :3], enough)
+        return used & ~far_smaller(tracks.mean[:, 2], tracks.largest <= _USUAL, used)
 
     def searches(self, tracks: FaceTracks) -> bool:
         """Return whether faces are searched for in the next frame, so that `step` needs its image."""
-        return self._is_due(tracks.frame, bool(self.usable(tracks).any()))
+        used = self.usable(tracks)
+        return self._is_due(tracks.frame, bool(used.any()), self._interval(tracks, used))
 
-    def _is_due(self, frame: int, known: bool) -> bool:
+    def _is_due(self, frame: int, known: bool, interval: int) -> bool:
         """Return whether a frame is searched, by its number and whether a face is known."""
-        return not known or not (frame % self.every and frame % self.whole_every)
+        return not known or not (frame % self.every and frame % interval)
+
+    def _interval(self, tracks: FaceTracks, used: Bool[Tensor, " N"]) -> int:
+        """Return the number of frames from one search of the whole image to the next."""
+        if not bool(used.any()):
+            return self.search_every
+        if bool((tracks.mean[used, 2] > _USUAL).any()):
+            return self.whole_every
+        return min(self.whole_every, _SEARCHES_FOR_LARGER * self.search_every)
 
     def step(self, tracks: FaceTracks, image: Image | None) -> FaceTracks:
         """Return the faces of the next frame.
@@ -164,27 +177,29 @@ class FaceTracker(nn.Module):
             InputError: another kind of image.
         """
         predicted = self._predict(tracks)
-        known = bool(self.usable(tracks).any())
-        if image is None or not self._is_due(tracks.frame, known):
+        used = self.usable(tracks)
+        known, interval = bool(used.any()), self._interval(tracks, used)
+        if image is None or not self._is_due(tracks.frame, known, interval):
             return predicted
-        everywhere = tracks.frame % (self.whole_every if known else self.search_every) == 0
+        everywhere = tracks.frame % interval == 0
         found = [self._look_near(image, face) for face in predicted.mean[:, :3].tolist()]
         if everywhere:  # last, since sizes of known faces are measured better near them
-            used = predicted.mean[self.usable(predicted), 2]
+            usual = bool((predicted.mean[self.usable(predicted), 2] > _USUAL).any())
+            soon = known and tracks.frame % self.whole_every != 0
             turn = _TILT if tracks.frame // self.search_every % 2 else -_TILT
-            found.append(self._look_everywhere(image, bool((used > _USUAL).any()), turn))
+            found.append(self._look_everywhere(image, usual or soon, turn))
         if not found:
             return predicted
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
-    def _look_everywhere(self, image: Image, usual: bool, turn: float) -> Float[Tensor, "N 3"]:
-        """Return the detections in the whole image: without a `usual` face, tilted or small ones as well.
+    def _look_everywhere(self, image: Image, plain: bool, turn: float) -> Float[Tensor, "N 3"]:
+        """Return the detections in the whole image: where these are none, tilted or small ones as well.
 
         Args:
-            usual: whether a face of the usual size is known. turn: of the image, degrees.
+            plain: whether tilted and small faces are left out. turn: of the image, degrees.
         """
         found = self.detector(image)
-        if usual or len(found):
+        if plain or len(found):
             return found
         found = _turned_search(self.detector, image, None, turn)
         if len(found) or self.smallest >= _USUAL:
@@ -239,14 +254,15 @@ class FaceTracker(nn.Module):
         mean, cov, _ = kalman_update(tracks.mean, tracks.cov, z, noise, self.observed, mask)
         hits = torch.where(seen, (tracks.hits + 1).clamp_max(self.memory), tracks.hits - 1 / 3)
         unseen = torch.where(seen, 0, tracks.unseen)
+        largest = tracks.largest.maximum(mean[:, 2])
         alive = hits > 0
-        kept = [x[alive] for x in (mean, cov, hits, tracks.age, unseen, tracks.identity)]
+        kept = [x[alive] for x in (mean, cov, hits, tracks.age, unseen, largest, tracks.identity)]
         new = self._new_tracks(found[owner < 0], tracks.next_identity)
-        mean, cov, hits, age, unseen, identity = (
+        mean, cov, hits, age, unseen, largest, identity = (
             torch.cat(pair) for pair in zip(kept, new, strict=True)
         )
         following = tracks.next_identity + len(new[0])
-        return FaceTracks(mean, cov, hits, age, unseen, identity, tracks.frame, following)
+        return FaceTracks(mean, cov, hits, age, unseen, largest, identity, tracks.frame, following)
 
     def _new_tracks(self, found: Tensor, first: int) -> tuple[Tensor, ...]:
         n = len(found)
@@ -255,7 +271,8 @@ class FaceTracker(nn.Module):
         cov = torch.diag_embed((spread * size[:, None]).square())
         count = torch.zeros(n, dtype=torch.long)
         mean = torch.cat([found, torch.zeros_like(found)], 1)
-        return mean, cov, torch.ones_like(size), count, count.clone(), first + torch.arange(n)
+        number = first + torch.arange(n)
+        return mean, cov, torch.ones_like(size), count, count.clone(), size.clone(), number
 
     def _noise(self, size: Tensor) -> Tensor:
         return torch.diag_embed((self.std * size[:, None]).square().expand(-1, 3))
@@ -296,16 +313,6 @@ def _region(face: list[float], shape: tuple[int, ...]) -> Region:
     left, right = (min(max(0, int(face[0] + side)), shape[1]) for side in (-reach, reach))
     top, bottom = (min(max(0, int(face[1] + side)), shape[0]) for side in (-reach, reach))
     return Region(left, top, right, bottom, _SMALLER * size, _LARGER * size)
-
-
-def _on_somebody(faces: Float[Tensor, "N 3"], known: Bool[Tensor, " N"]) -> Bool[Tensor, " N"]:
-    """Return which faces are far smaller than a known one on whose head or chest they are."""
-    if len(faces) < 2:  # none is smaller than itself
-        return torch.zeros_like(known)
-    size = faces[known, 2]
-    x, y = ((faces[:, None, :2] - faces[known, :2]) / size[:, None]).unbind(-1)
-    near = (x.abs() < _BESIDE) & (y > -_ABOVE) & (y < _BELOW)
-    return (near & (faces[:, 2, None] < _SMALLER_BY * size)).any(1)
 
 
 def _nearest(faces: Tensor, found: Tensor, gate: float) -> Int[Tensor, " n"]:
