@@ -5,7 +5,7 @@ from itertools import islice
 import numpy as np
 
 from torchpose._core.images import Image
-from torchpose.measure._face import HaarFaceDetector
+from torchpose.measure._face_detector import HaarFaceDetector
 from torchpose.video._source_interface import VideoSource
 
 _FRAMES, _APART = 6, 50  # that are looked at, and frames from one to the next
