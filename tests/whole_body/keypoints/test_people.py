@@ -11,6 +11,7 @@ from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body import BodyTracker
 from torchpose.whole_body._keypoints.people_association import assign, detection_gains
 from torchpose.whole_body._keypoints.people_tracker import PeopleTracker
+from torchpose.whole_body._keypoints.people_turns import turns_of_all
 from torchpose.whole_body._keypoints.turned_cameras import angles_of
 
 T = 40
@@ -88,6 +89,63 @@ def test_a_camera_that_is_turned_is_turned_back_for_everybody():
     for track in found:
         angles = torch.rad2deg(angles_of(track.details["camera_turn"][-1]))
         assert angles.tolist() == pytest.approx([0.0, 1.5, 0.0, 0.0], abs=0.1)
+
+
+def with_turns(rig, degrees):
+    """The rig, of which each camera is said to be turned by so much about an axis of its own."""
+    generator = torch.Generator().manual_seed(3)
+    axis = torch.randn(len(rig), 3, generator=generator, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(axis, dim=-1)
+    turn = rotvec_to_matrix(torch.deg2rad(torch.tensor(degrees))[:, None] * axis)
+    rig.rotation[:] = turn @ rig.rotation
+    rig.translation[:] = (turn @ rig.translation[..., None]).squeeze(-1)
+    return rig
+
+
+@pytest.mark.parametrize("degrees", [(0.0, 4.0, 0.0, 0.0), (1.5, 1.5, 1.5, 1.5)])
+def test_detections_of_turned_cameras_are_those_of_persons_and_begin_nobody(degrees):
+    rig, joints, pixels = passing(4)
+    pixels = shuffled(pixels)[0][:15]
+    found = tracker(with_turns(rig, degrees))(keypoints=pixels, persons="all")
+    assert [(one.first_frame, len(one)) for one in found] == [(0, 15), (0, 15)]
+    for one in found:
+        assert bool((one.details["detection"] >= 0).all())
+        assert float(one.details["inlier"].mean()) > 0.8
+        off = (one.joints3d - joints[:15].movedim(1, 0)).norm(dim=-1).mean((1, 2))
+        assert float(off.min()) < 0.04
+        assert any("against the calibration" in note for note in one.notes)
+
+
+def test_two_detections_of_two_cameras_tell_no_turn():
+    rig, _, pixels = passing(3)
+    people = tracker(rig).by_keypoints
+    none = torch.eye(3).double().expand(3, 3, 3)
+
+    def told(keypoints):
+        trust = torch.full_like(keypoints[..., 0], 0.9)
+        frame, _ = people.reader.frames_and_feet(
+            keypoints.transpose(0, 1), trust.transpose(0, 1), None, None
+        )
+        return turns_of_all(people.tracker.filter, frame, none)
+
+    assert abs(told(pixels[0]).gain) < 1.0  # both persons in all cameras, which are right
+    apart = pixels[0].clone()
+    apart[0, 1] = apart[1, 0] = apart[2] = math.nan
+    assert told(apart) is None
+
+
+def test_a_note_names_the_camera_whose_detections_are_nobodys():
+    rig, _, pixels = passing(3)
+    notes = [
+        one.notes
+        for degrees in (0.0, 40.0)
+        for one in tracker(with_turns(rig, (0.0, degrees, 0.0)))(keypoints=pixels, persons="all")
+    ]
+    assert len(notes) == 4
+    said = [[note for note in own if "sees somebody where nobody is" in note] for own in notes]
+    assert said[:2] == [[], []]
+    for (note,) in said[2:]:
+        assert note.startswith("in 100 % of its frames camera c1")
 
 
 def test_live_has_the_same_numbers():

@@ -41,12 +41,12 @@ from torchpose.whole_body._keypoints.turned_cameras import (
 
 LEAST_CAMERAS = 3
 LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
+LEAST_GAIN = 10.0  # log-evidence by which an explanation must be better than right cameras
 _PATIENCE = (
     0.5  # seconds for which a camera sees something else before an explanation is looked for
 )
 _PAUSE = 5.0  # seconds until the next search, where none was found
 _WIDE = 2.0  # factor of the noise's variance, above which a camera may be wrong
-_LEAST_GAIN = 10.0  # log-evidence by which an explanation must be better than right cameras
 _FARTHEST_TURN = 0.5  # radians, of a camera that is used nevertheless
 _RETURN = 0.25  # seconds for which a camera sees the body again before it counts again
 _HEADINGS = 2
@@ -105,7 +105,7 @@ def _righted(
     return frame._replace(inlier=frame.inlier.masked_fill(off[..., None], 0.0))
 
 
-def _any_wrong(off: Bool[Tensor, "B C"], turn: Float[Tensor, "B C 3 3"]) -> Bool[Tensor, " B"]:
+def any_wrong(off: Bool[Tensor, "B C"], turn: Float[Tensor, "B C 3 3"]) -> Bool[Tensor, " B"]:
     """Return whose cameras include one that counts not, or is turned."""
     return (off | is_turned(turn)).any(-1)
 
@@ -163,13 +163,12 @@ def find_faults(
     frame: KeypointFrame,
     faults: CameraFaults,
     begun: CorrectedBody | None = None,
-    turns_alone: bool = False,
 ) -> tuple[CameraFaults, CorrectedBody, Bool[Tensor, " B"]]:
     """Return the likeliest faults of cameras, who begins anew with them, and whether they are new.
 
     Args:
         filter: that tracks on. frame: keypoints as they were detected. faults: that were known so far.
-        begun: who has just begun with these, if all have. turns_alone: whether all cameras see the person.
+        begun: who has just begun with these, if all have.
     """
     known = start(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
     least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) - unlikely(faults.turn)
@@ -181,12 +180,11 @@ def find_faults(
     right = _righted(given, turn, off, filter.maps)
     found = start(filter, right, _HEADINGS)
     evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
-    wrong = _any_wrong(off, turn)
+    wrong = any_wrong(off, turn)
     refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
-    refused = refused | off if turns_alone else refused
     evidence = torch.where(refused.any(-1) & wrong, -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
-    better = evidence.amax(-1) > least + _LEAST_GAIN
+    better = evidence.amax(-1) > least + LEAST_GAIN
     looks = TurnLooks.begun(frame, tried.turn[:, : tried.n_turns])
     looks = looks._replace(n_frames=is_turned(turn[best]).any(-1).to(looks.n_frames))
     new = faults._replace(
@@ -202,9 +200,9 @@ def find_faults(
     return after, replaced(known, rows, taken(found, best[rows])), better
 
 
-def paused(filter: BodyKalmanFilter, faults: CameraFaults) -> CameraFaults:
+def paused(filter: BodyKalmanFilter, faults: CameraFaults, seconds: float = _PAUSE) -> CameraFaults:
     """Return the faults with no further search for some seconds."""
-    return faults._replace(doubted=torch.full_like(faults.doubted, -_PAUSE * filter.fps))
+    return faults._replace(doubted=torch.full_like(faults.doubted, -seconds * filter.fps))
 
 
 def _of_nobody(
@@ -246,7 +244,7 @@ def looked_at_again(
     enough = _enough(frame).sum(-1) >= LEAST_CAMERAS
     looks, rows, best = looked_again(faults.looks, frame, enough, filter.maps, filter.fps)
     turn = faults.turn.index_copy(0, rows, best)
-    wrong = _any_wrong(faults.off, turn)
+    wrong = any_wrong(faults.off, turn)
     looks = looks._replace(n_frames=torch.where(wrong, looks.n_frames, 0.0))
     return faults._replace(turn=turn, wrong=wrong, looks=looks)
 
@@ -258,19 +256,23 @@ def watched(
     frame: KeypointFrame,
     begun: Bool[Tensor, " B"],
     started: Bool[Tensor, " B"],
+    astray: Bool[Tensor, " B"] | None = None,
 ) -> tuple[CameraFaults, Bool[Tensor, " B"]]:
     """Return the faults with a frame counted, and for whom an explanation is to be looked for.
 
     Args:
         filter: that found. faults: that are known. found: the bodies. frame: their keypoints.
-        begun: who is tracked by all cameras. started: with this frame.
+        begun: who is tracked by all cameras. started: with this frame. astray: for whom cameras see somebody
+            where nobody is.
     """
     doubtful = _few_or_wide(found, frame)
-    if not bool((doubtful | started[:, None] | (faults.doubted != 0)[:, None]).any()):
-        return faults, started
+    also = started if astray is None else started | astray
+    if not bool((doubtful | also[:, None] | (faults.doubted != 0)[:, None]).any()):
+        return faults, also
     enough = _enough(frame)
     doubtful = doubtful | (started[:, None] & (_noise(filter, found, frame) > _WIDE))
     doubtful = (doubtful & enough).any(-1) & begun & (enough.sum(-1) >= LEAST_CAMERAS)
+    doubtful = doubtful if astray is None else doubtful | astray
     pausing = faults.doubted < 0
     doubted = torch.where(doubtful | pausing, faults.doubted + 1, 0.0)
     due = doubtful & ~pausing & (started | (doubted > _PATIENCE * filter.fps))
@@ -295,7 +297,7 @@ def with_returned(
     sees = _enough(frame) & (weighed.inlier.sum(-1) >= FEW_INLIERS * frame.inlier.sum(-1))
     back = torch.where(faults.off & sees, faults.back + 1, 0.0)
     off = faults.off & (back <= _RETURN * filter.fps)
-    wrong = _any_wrong(off, faults.turn)
+    wrong = any_wrong(off, faults.turn)
     return faults._replace(off=off, back=back, wrong=wrong)
 
 

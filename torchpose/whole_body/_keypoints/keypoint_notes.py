@@ -17,6 +17,7 @@ _GAP = 30  # frames without keypoints that are worth a word
 _LEAST_TURN = (
     0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
 )
+_STRAYS = 30.0  # percent of its frames in which a camera sees somebody where nobody is
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
 _DOWN = 0.5  # of a unit vector, along the columns of an image
 _LYING = 60.0  # degrees of the trunk from the axis that points up, from which on it is said
@@ -181,6 +182,24 @@ def notes_on_turned_cameras(
             f"camera {cameras[c]} (by {angle} from frame {first_frame + int(frames[0])} on)"
         )
     return (_turned_back(said, "were"),) if said else ()
+
+
+def notes_on_strays(
+    cameras: Sequence[str], strays: Bool[Tensor, "T C"], there: Bool[Tensor, "T C"]
+) -> tuple[str, ...]:
+    """Return notes on cameras that see somebody where nobody is.
+
+    Args:
+        cameras: their names. strays: whether a camera had a detection that is nobody's, and none of somebody.
+        there: whether it had any detection.
+    """
+    share = 100 * strays.sum(0) / there.sum(0).clamp_min(1)
+    return tuple(
+        f"in {float(share[c]):.0f} % of its frames camera {cameras[c]} sees somebody where nobody is, and "
+        "misses somebody who is there: its calibration may be wrong, its input that of another camera, or "
+        "its video late or mirrored"
+        for c in ((share > _STRAYS) & (strays.sum(0) >= _GAP)).nonzero().flatten().tolist()
+    )
 
 
 def notes_on_cameras_now(

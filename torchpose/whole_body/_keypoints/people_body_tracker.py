@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -23,6 +24,7 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import (
     with_time,
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_notes import notes_on_strays
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import to_be_smoothed
 from torchpose.whole_body._keypoints.nested import FrameCollector, stacked, taken
@@ -30,6 +32,7 @@ from torchpose.whole_body._keypoints.people_association import (
     pairs_of_detections,
     taken_detections,
 )
+from torchpose.whole_body._keypoints.people_cameras import strays_of
 from torchpose.whole_body._keypoints.people_tracker import (
     PeopleFrame,
     PeopleStream,
@@ -100,19 +103,25 @@ class PeopleBodyTracker:
         if not bool((frames.inlier > 0).any()):
             raise NobodySeenError("the detections have no keypoint in any camera and frame")
         stream, rows = None, defaultdict[int, list[_Row]](list)
+        strays = torch.zeros(frames.inlier.shape[0], frames.inlier.shape[2], dtype=torch.bool)
         for t in tqdm(range(len(keypoints)), disable=not progress, unit="frame"):
             frame = frames.map(lambda value: value[t])  # noqa: B023
             stream, found = self.people.advance(stream, frame)
-            numbers = [] if found is None else found.number.tolist()
-            for row, number in enumerate(numbers):
-                rows[number].append(_Row(t, row, found))  # type: ignore[arg-type]  # not None
+            if found is None:
+                continue
+            strays[t] = strays_of(frame, found.detection)
+            for row, number in enumerate(found.number.tolist()):
+                rows[number].append(_Row(t, row, found))
         persons = [_until_last_seen(of_one) for of_one in rows.values()]
         identities = [int(one[-1].frame.identity[one[-1].row]) for one in persons]
         named = sorted((who, i) for i, who in enumerate(identities) if who > 0)
         self._check_cameras([row for _, i in named for row in persons[i]])
         if not named:
             self._check_cameras_of_pairs(frames)
-        return [self._track(persons[i], who, feet, smoothing == "full") for who, i in named]
+        there = (frames.inlier > 0).any(-1).any(1).cpu()
+        notes = notes_on_strays(self.single.rig.names, strays, there)
+        tracks = [self._track(persons[i], who, feet, smoothing == "full") for who, i in named]
+        return [replace(track, notes=track.notes + notes) for track in tracks]
 
     @torch.no_grad()
     def step(

@@ -1,21 +1,23 @@
 """Find turned cameras where there are several persons: one belief about the cameras, shared by all.
 
-The person of whom cameras have most keypoints is the witness. What is believed of the cameras is told by the
-witness as by a single person (`faulty_cameras`), and holds for all detections before anybody gets them.
-Turns that are found with the witness hold if they also explain the others, who all begin anew with them. A
-camera that sees nothing of the witness is not left out: nobody gets its detections anyway.
+A camera may be turned if the person of whom cameras have most keypoints says so as a single person would
+(`faulty_cameras`), if detections belong to nobody while persons have none in that camera, and where somebody
+begins. Then turns are looked for that explain all detections of the
+frame (`people_turns`). They hold for all detections before anybody gets them, and are estimated again from
+later frames by the keypoints of several persons. No camera is left out: nobody gets its detections anyway.
 """
 
-from typing import NamedTuple
-
+import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import CorrectedBody
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
+    LEAST_GAIN,
     CameraFaults,
+    any_wrong,
     corrected,
-    find_faults,
     looked_at_again,
     paused,
     watched,
@@ -24,14 +26,13 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.people_association import LEAST_JOINTS, owned_detections
+from torchpose.whole_body._keypoints.people_turns import side_by_side, turns_of_all
+from torchpose.whole_body._keypoints.turn_looks import TurnLooks
+from torchpose.whole_body._keypoints.turned_cameras import is_turned
 
-
-class Tracked(NamedTuple):
-    """Holds P persons of a frame: their streams, their poses, and what their correction gave."""
-
-    bodies: KeypointStream
-    poses: KeypointPoses
-    corrected: CorrectedBody
+_UNTOLD = 0.5  # seconds until the next search, where a frame does not tell turns
+_WITNESSES = 3  # persons whose keypoints tell turns after the first frame
 
 
 def righted(
@@ -44,54 +45,70 @@ def righted(
     return corrected(frame, every, tracker.filter.maps)
 
 
-def with_watched_cameras(
+def watched_cameras(
     tracker: KeypointTracker,
     faults: CameraFaults | None,
-    tracked: Tracked,
+    tracked: tuple[KeypointStream, KeypointPoses, CorrectedBody],
     frame: KeypointFrame,
-) -> tuple[CameraFaults | None, Tracked]:
-    """Return what is believed of cameras after a frame, and the persons, begun anew where that changed.
+    strays: Bool[Tensor, " C"],
+) -> tuple[CameraFaults, bool]:
+    """Return what is believed of cameras after a frame, and whether turns are to be looked for.
 
     Args:
         tracker: of single persons. faults: what was believed, of one element; None where nothing was yet.
-        tracked: the persons. frame: their keypoints [P, C, J], as they were detected.
+        tracked: P persons. frame: their keypoints [P, C, J], as they were detected.
+        strays: of `strays_of`.
     """
+    beside = _of_witnesses(frame)
+    faults = CameraFaults.none(beside) if faults is None else faults
     if frame.inlier.shape[1] < LEAST_CAMERAS:
-        return faults, tracked
+        return faults, False
+    faults = looked_at_again(tracker.filter, faults, beside)
+    started = tracked[1].started.any() & (faults.looks.n_frames == 0)
+    astray = started | strays.any()
     witness = (frame.inlier > 0).sum((-2, -1)).argmax()[None]
-    given = frame.take(witness)
-    faults = CameraFaults.none(given) if faults is None else faults
-    faults = looked_at_again(tracker.filter, faults, given)
-    bodies, poses, found = taken(tracked, witness)
-    fresh = poses.started & (faults.looks.n_frames == 0)
-    right = righted(tracker, given, faults)
+    bodies, _, found = taken(tracked, witness)
     several = bodies.begun & (bodies.alone < 0)
-    faults, due = watched(tracker.filter, faults, found, right, several, fresh)
-    if bool(due):
-        faults, tracked = _explained(tracker, faults, tracked, frame, witness)
-    turn = faults.turn.expand_as(tracked.poses.turn)
-    return faults, tracked._replace(poses=tracked.poses._replace(turn=turn))
+    right = righted(tracker, frame.take(witness), faults)
+    faults, due = watched(tracker.filter, faults, found, right, several, started, astray)
+    return faults, bool(due)
 
 
-def _explained(
-    tracker: KeypointTracker,
-    faults: CameraFaults,
-    tracked: Tracked,
-    frame: KeypointFrame,
-    witness: Tensor,
-) -> tuple[CameraFaults, Tracked]:
-    """Return other faults, and all persons begun anew, if that explains what cameras see."""
-    new, _, better = find_faults(tracker.filter, frame.take(witness), faults, turns_alone=True)
-    if not bool(better):
-        return new, tracked
-    before, after = (
-        Tracked(*tracker.advance(None, righted(tracker, frame, one), watch=False))
-        for one in (faults, new)
-    )
-    sure = before.bodies.begun & after.bodies.begun
-    gain = (after.corrected.log_evidence - before.corrected.log_evidence).masked_fill(~sure, 0.0)
-    if float(gain.sum() - gain[witness]) < 0:
-        return paused(tracker.filter, faults), tracked
-    rows = sure.nonzero().squeeze(-1)
-    tracked = mapped(lambda old, begun: old.index_copy(0, rows, begun[rows]), tracked, after)
-    return new, tracked
+def explained(
+    tracker: KeypointTracker, faults: CameraFaults, frame: KeypointFrame
+) -> tuple[CameraFaults, bool]:
+    """Return turns of cameras that explain detections [D, C, J] of a frame, and whether they are new."""
+    found = turns_of_all(tracker.filter, frame, faults.turn[0])
+    if found is None:
+        return paused(tracker.filter, faults, _UNTOLD), False
+    if found.gain <= 0:
+        return paused(tracker.filter, faults), False
+    turn = found.turn[found.best][None]
+    looks = TurnLooks.begun(_of_witnesses(found.persons), found.turn[None])
+    looks = looks._replace(n_frames=is_turned(turn).any(-1).to(looks.n_frames))
+    faults = faults._replace(looks=looks, doubted=torch.zeros_like(faults.doubted))
+    if found.gain <= LEAST_GAIN:
+        return faults, False
+    return faults._replace(turn=turn, wrong=any_wrong(faults.off, turn)), True
+
+
+def strays_of(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> Bool[Tensor, " C"]:
+    """Return which cameras have a detection that is nobody's, and none of somebody who is there.
+
+    Args:
+        frame: [D, C, J]; of a detection so many joints count with which a person could begin.
+        chosen: the persons' detections, -1 if none.
+    """
+    enough = (frame.inlier > 0).sum(-1) >= LEAST_JOINTS
+    left = enough.mT & ~owned_detections(chosen, len(frame.inlier))
+    return left.any(-1) & (chosen < 0).any(0)
+
+
+def _of_witnesses(frame: KeypointFrame) -> KeypointFrame:
+    """Return the keypoints [1, C, W J] of the W persons who have most, side by side."""
+    count = (frame.inlier > 0).sum((-2, -1))
+    rows = count.topk(min(_WITNESSES, len(count))).indices.sort().values
+    some = frame.take(rows)
+    none = frame.map(lambda value: value.new_ones(_WITNESSES - len(rows), *value.shape[1:]))
+    none = none._replace(inlier=torch.zeros_like(none.inlier))
+    return side_by_side(mapped(lambda *both: torch.cat(both), some, none))

@@ -22,9 +22,10 @@ from torchpose.whole_body._keypoints.people_association import (
     taken_detections,
 )
 from torchpose.whole_body._keypoints.people_cameras import (
-    Tracked,
+    explained,
     righted,
-    with_watched_cameras,
+    strays_of,
+    watched_cameras,
 )
 
 _CONFIRM_TIME, _CONFIRM_FRAMES = 0.1, 3  # seconds, and frames at least, that confirm a person
@@ -112,20 +113,30 @@ class PeopleTracker:
         if found is None:
             return stream, None
         stream, found = self._watched(stream, found, detected)
+        if found is None:
+            return stream, None
         stream = self._counted(stream, found)
         return self._without_gone(stream), found._replace(identity=stream.identity)
 
     def _watched(
         self, stream: PeopleStream, found: PeopleFrame, detected: KeypointFrame
-    ) -> tuple[PeopleStream, PeopleFrame]:
+    ) -> tuple[PeopleStream, PeopleFrame | None]:
         """Return the stream and the frame, with keypoints as they were detected, by cameras as they are."""
         assert stream.bodies is not None
         keypoints = taken_detections(detected, found.detection)
-        tracked = Tracked(stream.bodies, found.poses, found.corrected)
-        faults, tracked = with_watched_cameras(self.tracker, stream.faults, tracked, keypoints)
-        bodies, poses, corrected = tracked
-        stream = stream._replace(bodies=bodies, faults=faults)
-        return stream, found._replace(keypoints=keypoints, poses=poses, corrected=corrected)
+        tracked = stream.bodies, found.poses, found.corrected
+        strays = strays_of(detected, found.detection)
+        faults, due = watched_cameras(self.tracker, stream.faults, tracked, keypoints, strays)
+        if due:
+            faults, better = explained(self.tracker, faults, detected)
+            if better:
+                stream, after = self._begun_anew(stream._replace(faults=faults), found, detected)
+                if after is None:
+                    return stream, None
+                found, keypoints = after, taken_detections(detected, after.detection)
+        turn = faults.turn.expand_as(found.poses.turn)
+        poses = found.poses._replace(turn=turn)
+        return stream._replace(faults=faults), found._replace(keypoints=keypoints, poses=poses)
 
     # --- persons who are there --------------------------------------------------------------------
 
@@ -185,7 +196,35 @@ class PeopleTracker:
         owner = _owners(groups, found, weak)
         again = (owner & (owner.cumsum(1) > 1)).any(0)  # a second group of the same person
         chosen = (owner.sum(0) <= 1) & ~again & self._has_room(~owner.any(0), len(stream.number))
-        groups, owner = groups[chosen], owner[:, chosen]
+        return self._begun(stream, found, frame, groups[chosen], owner[:, chosen])
+
+    def _begun_anew(
+        self, stream: PeopleStream, found: PeopleFrame, detected: KeypointFrame
+    ) -> tuple[PeopleStream, PeopleFrame | None]:
+        """Return the stream and the frame with all persons begun by cameras that are turned otherwise.
+
+        A person whose detections are in a group stays the same. Another with detections in it was nobody.
+        """
+        frame = righted(self.tracker, detected, stream.faults)
+        groups = group_detections(self.tracker.filter.maps, frame, (frame.inlier > 0).any(-1).mT)
+        shares = _owners(groups, found, torch.ones_like(stream.number, dtype=torch.bool))
+        owner = shares & (shares.cumsum(0) == 1)
+        owner = owner & (owner.cumsum(1) == 1)
+        rows = (owner.any(1) | ~shares.any(1)).nonzero().squeeze(-1)
+        rest = taken(found, rows) if len(rows) else None
+        stream, owner = self._kept(stream, rows), owner[rows]
+        chosen = self._has_room(~owner.any(0), len(rows))
+        return self._begun(stream, rest, frame, groups[chosen], owner[:, chosen])
+
+    def _begun(
+        self,
+        stream: PeopleStream,
+        found: PeopleFrame | None,
+        frame: KeypointFrame,
+        groups: Int[Tensor, "G C"],
+        owner: Bool[Tensor, "P G"],
+    ) -> tuple[PeopleStream, PeopleFrame | None]:
+        """Return the stream and the frame with persons who begin with groups, or their owners begun anew."""
         if not len(groups):
             return stream, found
         keypoints = taken_detections(frame, groups)

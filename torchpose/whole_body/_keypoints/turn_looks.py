@@ -115,7 +115,7 @@ def _estimated(
         looks.turn.flatten(0, 1),
     )  # fmt: skip
     turn = found.matrix.view_as(looks.turn)
-    cost = _with_odds((found.misfit.sum(-1) + found.price).view(n, -1), angles_of(turn))
+    cost = with_odds((found.misfit.sum(-1) + found.price).view(n, -1), angles_of(turn))
     chosen = rows * len(free) + cost.argmin(-1)
     lasting = _lasting(found.errors[chosen], found.weights[chosen], used)
     poor = (found.misfit[chosen] > _POOR * side_by_side.inlier.sum(-1)).any(-1)
@@ -155,7 +155,7 @@ def _mean_turn(
     return torch.where(none[:, None, None, None], turn[:, -1], mean)
 
 
-def _with_odds(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Float[Tensor, "B H"]:
+def with_odds(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Float[Tensor, "B H"]:
     """Return what explanations cost with the prior odds of one camera and of all.
 
     Args:
