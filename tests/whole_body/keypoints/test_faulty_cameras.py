@@ -119,6 +119,21 @@ def test_turns_become_better_known_with_more_frames(three):
     assert float(errors[-1]) < 0.6 * float(errors[0])
 
 
+def test_turns_of_several_persons_are_told_by_different_numbers_of_frames(three):
+    _, filter, frames = turned_scene(three, (0.0, 0.0, 3.0))
+    faults, _, _ = find_faults(filter, both := frames[0].take(torch.tensor([0, 0])),
+                               CameraFaults.none(both))  # fmt: skip
+    alone, _, _ = find_faults(filter, frames[0], CameraFaults.none(frames[0]))
+    for t, frame in enumerate(frames[1:6], 1):
+        both = frame.take(torch.tensor([0, 0]))
+        both.inlier[1] = both.inlier[1] * (t > 4)
+        faults = looked_at_again(filter, faults, both)
+        alone = looked_at_again(filter, alone, frame)
+    assert faults.looks.n_frames.tolist() == [3.0, 2.0]
+    torch.testing.assert_close(faults.turn[:1], alone.turn)
+    assert bool(faults.turn.isfinite().all())
+
+
 def looked_at(three, errors):
     """What is believed of turned cameras after frames of a body that stands still, with errors in pixels."""
     _, filter, frames = turned_scene(three, (0.0, 5.0, 0.0))

@@ -58,6 +58,7 @@ class TurnLooks(NamedTuple):
         frames = frame.map(
             lambda value: torch.zeros_like(value[:, None]).repeat_interleave(_FRAMES, 1)
         )
+        frames = frames._replace(variance=torch.ones_like(frames.variance))
         eye = torch.eye(3).to(frame.pixels)
         turn = eye.expand(count, n_cameras + 2, n_cameras, 3, 3)
         zero = frame.inlier.new_zeros(count)
