@@ -25,7 +25,7 @@ from torchpose.whole_body._keypoints.camera_refinement import DELAY, _corrected
 from torchpose.whole_body._keypoints.coarse_delays import coarse_delays, shifted
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
-T = 40
+T = 32
 TURN = (0.6, -0.7, 0.4)  # direction of a rotation, and of a shift
 SHIFT = (-0.5, 0.5, 0.7)
 
