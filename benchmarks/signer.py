@@ -62,7 +62,7 @@ def run(
     Args:
         data: folder signer, or the one it is in. out: folder for the results.
         seed: not used, nothing is drawn. progress: whether to show bars.
-        quick: four videos of at most 60 frames and five learning steps.
+        quick: four videos of at most 45 frames and five learning steps.
         learning_steps: steps of Adam.
 
     Raises:
@@ -73,7 +73,7 @@ def run(
     prior = UpperBodyPrior.from_released(folder / _PRIOR)
     videos = read_videos(folder)
     if quick:
-        videos, learning_steps = _cut(videos, 4, 60), min(learning_steps, 5)
+        videos, learning_steps = _cut(videos, 4, 45), min(learning_steps, 5)
     report = Report("Signer", {
         "quick": quick, "prior": _PRIOR, "videos": len(videos.names),
         "frames": int(videos.lengths.sum()), "learning steps": learning_steps,

@@ -41,7 +41,7 @@ _PERSONS = {"s09": "a05_wave_two_hands", "s10": "a07_clap", "s11": "a04_punch", 
 _VIEWS = {"front": 0.0, "oblique": 45.0, "side": 90.0}  # degrees to the person's left
 _HEIGHTS, _DISTANCE, _AIM = (0.75, 1.3, 2.2), 2.5, 0.7  # metres; heights above the floor
 _SOLE = 0.08  # metres, of an ankle above the floor
-_FRAMES, _QUICK_FRAMES = 60, 20
+_FRAMES, _QUICK_FRAMES = 60, 10
 _LEVEL = math.sin(math.radians(30.0))  # of thighs, downwards, while somebody sits
 _PELVIS = BODY_15.joint("pelvis")
 _HIPS, _KNEES, _ANKLES = (
@@ -66,7 +66,7 @@ def add_sitting_table(
 
     Args:
         report: gets the table. methods: by name, of one camera. data: folder with the sets.
-        quick: one person and few frames, to see that it works.
+        quick: one person, one height and few frames, to see that it works.
     """
     views = sitting_clips(data, quick)
     table = report.table("sitting", "One camera, people who sit (mm)", [*_COLUMNS], digits=_DIGITS,
@@ -84,12 +84,13 @@ def sitting_clips(data: Path, quick: bool = False) -> dict[str, list[Clip]]:
     """Return clips of people who sit, by the side from which they are seen.
 
     Args:
-        data: folder with the sets. quick: one person and few frames.
+        data: folder with the sets. quick: one person, one height and few frames.
     """
     persons = [_sitter(data, person, arms, _QUICK_FRAMES if quick else _FRAMES)
                for person, arms in list(_PERSONS.items())[: 1 if quick else None]]  # fmt: skip
+    heights = _HEIGHTS[:1] if quick else _HEIGHTS
     return {
-        view: [_seen(one, azimuth, height) for one in persons for height in _HEIGHTS]
+        view: [_seen(one, azimuth, height) for one in persons for height in heights]
         for view, azimuth in _VIEWS.items()
     }
 

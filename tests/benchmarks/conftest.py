@@ -36,5 +36,5 @@ def run_here(monkeypatch, capsys):
 
 @pytest.fixture(scope="session")
 def few_people(tmp_path_factory) -> Path:
-    """A folder kinect_utd_mhad with three recordings of each person."""
-    return few_recordings("kinect_utd_mhad", tmp_path_factory.mktemp("few-people"), 3)
+    """A folder kinect_utd_mhad with two recordings of each person."""
+    return few_recordings("kinect_utd_mhad", tmp_path_factory.mktemp("few-people"), 2)

@@ -72,7 +72,7 @@ def test_a_peer_that_is_missing_is_named_with_how_to_install_it(capsys):
 
 def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(run_here, tmp_path):
     persons = tuple(f"s0{i}" for i in range(1, 7))
-    recordings = few_recordings("kinect_utd_mhad", tmp_path, 12, persons)
+    recordings = few_recordings("kinect_utd_mhad", tmp_path, 6, persons)
     out = tmp_path / "levers"
     arguments = ("--quick", "--data", str(recordings), "--out", str(out), "--only")
     first = run_here("ub_people_levers", *arguments, "single")

@@ -124,7 +124,7 @@ def test_videos(tmp_path):
 @pytest.mark.slow
 def test_released_tracker(tmp_path):
     folder = data_dir_or_skip("signer")
-    report = signer.run(folder, tmp_path, progress=False, quick=True, learning_steps=3)
+    report = signer.run(folder, tmp_path, progress=False, quick=True, learning_steps=2)
     assert [row[2] for row in report["parity"].rows.values()] == ["yes"] * 4
     table = report["prediction_0.5"]
     assert table["learnt noise, ou", "mean"] > table["released", "mean"]
