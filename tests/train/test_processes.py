@@ -1,13 +1,11 @@
-"""Real processes: killed in the middle of a step, resumed, two of them, by Lightning and by torchrun."""
+"""Real processes: killed in the middle of a step, resumed, two of them as torchrun starts them."""
 
 import contextlib
 import os
 import signal
 import socket
-import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,7 +19,6 @@ from tests.train.test_fit import assert_same
 from torchpose.priors import load_prior
 from train.cli import end_process, main
 
-ROOT = Path(__file__).parents[2]
 LOCAL = {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "GLOO_SOCKET_IFNAME": "lo"}
 
 
@@ -133,22 +130,26 @@ def test_only_a_process_of_several_ends_without_clearing_up(monkeypatch, grouped
     assert stopped.value.code == 3
 
 
-def node_of(rank, port):
-    """What torchrun tells the process of one of two nodes."""
-    return LOCAL | {
-        "MASTER_PORT": str(port), "RANK": str(rank), "GROUP_RANK": str(rank), "LOCAL_RANK": "0",
-        "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "1", "TORCHELASTIC_RUN_ID": "fit",
-    }  # fmt: skip
+def started(arguments, folder, nodes=1):
+    """Two processes with what torchrun tells them, on one node or on two; its own start takes seconds.
 
-
-def torchrun(*arguments):
-    """Two processes that torchrun itself starts; it warns."""
-    how = ("--standalone", "--nproc-per-node", "2", "--local-addr", "127.0.0.1")
-    command = [sys.executable, "-m", "torch.distributed.run", *how, "-m", "train", "fit"]
-    return subprocess.run(
-        [*command, *map(str, arguments)], cwd=ROOT, env=os.environ | LOCAL,
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    `python -m train predict` is tested with torchrun itself.
+    """
+    port = str(free_port())
+    ours = {"MASTER_PORT": port, "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "fit"}
+    processes = []
+    for rank in range(2):
+        node, local = divmod(rank, 2 // nodes)
+        own = {
+            "RANK": rank,
+            "GROUP_RANK": node,
+            "LOCAL_RANK": local,
+            "LOCAL_WORLD_SIZE": 2 // nodes,
+        }
+        environment = LOCAL | ours | {name: str(value) for name, value in own.items()}
+        errors = folder / f"errors{rank}"
+        processes.append(ForkedFit(arguments, errors, environment=environment))
+    return processes
 
 
 def free_port():
@@ -159,7 +160,7 @@ def free_port():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="SIGKILL, and the loopback's name, are Linux's")
 def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
-    """One process dies in its third step, one of two nodes in the fifth; two that torchrun starts finish."""
+    """One process dies in its third step, one of two nodes in the fifth; two of one node finish."""
     values = settings(recordings, tmp_path / "one")
     assert main(["fit", "--config", str(write_settings(tmp_path / "one", values))]) == 0
     wanted = load_prior(tmp_path / "one" / "p.safetensors")
@@ -177,19 +178,15 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
 
     kill["init_args"] = {"step": 4, "rank": 1}
     write_settings(tmp_path / "dying", values)
-    port = free_port()
-    go_on = ["--config", dying, "--ckpt_path", "last"]
-    left, lost = (
-        ForkedFit(go_on, tmp_path / f"errors{rank}", environment=node_of(rank, port))
-        for rank in range(2)
-    )
+    left, lost = started(["--config", dying, "--ckpt_path", "last"], tmp_path, nodes=2)
     message = end(left)
     assert left.returncode > 0, message
     assert end(lost) == "" and lost.returncode == -signal.SIGKILL
     assert not out.exists()
 
-    done = torchrun("--config", config, "--ckpt_path", "last")
-    assert done.returncode == 0, done.stderr
+    for process in started(["--config", config, "--ckpt_path", "last"], tmp_path):
+        said = end(process)
+        assert process.returncode == 0, said
     prior = load_prior(out)
     assert_same(prior, wanted, 1e-8)
     assert prior.info.persons == wanted.info.persons
