@@ -128,8 +128,8 @@ def step_difference(way, name):
 
 
 def run_difference(way, name):
-    """Between whole sequences that were traced and plain ones, on other measurements."""
-    run, (z, mask) = Run(make(name)), sequences()
+    """Between sequences of two frames that were traced and plain ones, on other measurements."""
+    run, (z, mask) = Run(make(name)), (x[:, :2] for x in sequences())
     found = seeded(traced(way, run, (z, mask)), z + 0.5, ~mask)
     return largest_difference(found, seeded(run, z + 0.5, ~mask))
 
