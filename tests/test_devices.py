@@ -122,7 +122,7 @@ def body_tracker(seen, device, fps=FPS, **options):
 
 @pytest.mark.parametrize(("cameras", "height"), [(1, None), (1, 1.7), (2, None)])
 def test_whole_bodies(cameras, height, device):
-    seen = scene(cameras, 6)
+    seen = scene(cameras, 4)
     given = {"keypoints": seen.keypoints, "confidence": seen.confidence, "names": NAMES}
     here = body_tracker(seen, "cpu", camera_height=height)(**given, smoothing="full")
     with use_of(device):
@@ -184,7 +184,7 @@ def test_cameras_that_are_slightly_wrong(device):
 
 
 def test_several_persons(device):
-    seen = scene(2, 6)
+    seen = scene(2, 4)
     detections = torch.stack([seen.keypoints, seen.keypoints + 300], 2)
     trust = torch.stack([seen.confidence, 0 * seen.confidence], 2)
     given = {"keypoints": detections, "confidence": trust, "names": NAMES, "persons": "all"}
@@ -201,7 +201,7 @@ def silhouettes():
         PinholeCamera(80, 80, 39.5, 29.5, 80, 60, name, rotation=rotation, translation=(0, 0, 3))
         for name, rotation in (("front", (math.pi, 0, 0)), ("side", (HALF, 0, HALF)))
     ]
-    body, standing = Body.of_height(BODY_15, 1.75), torch.zeros(4, 36, dtype=torch.float64)
+    body, standing = Body.of_height(BODY_15, 1.75), torch.zeros(3, 36, dtype=torch.float64)
     images = render(body, standing, CameraRig(cameras), 60, 80)
     return images, cameras, body.joints(standing[0])
 
