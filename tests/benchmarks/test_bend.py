@@ -208,14 +208,11 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     assert str(again["dimensions"].rows) == str(report["dimensions"].rows)  # some are NaN
 
 
-def test_gates_of_other_dimensions_are_told_in_the_report(folder, tmp_path):
+def test_gates_of_other_dimensions_are_told_in_the_report(done, folder, tmp_path):
     found = bend.run(folder, tmp_path, part="particles", **SMALL, gate_dimensions=3)
     assert found.settings["dimensions of the gates"] == 3
     accepted = found["particles"]["10", "accepted (%)"]
-    narrow = bend.run(folder, tmp_path, part="particles", **SMALL)["particles"][
-        "10", "accepted (%)"
-    ]
-    assert accepted > narrow  # a gate in fewer dimensions lets more through
+    assert accepted > done[1]["particles"]["10", "accepted (%)"]  # fewer let more through
 
 
 @pytest.mark.parametrize(
