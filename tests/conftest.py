@@ -4,6 +4,7 @@ TORCHPOSE_SHAPE_CHECKS=0 switches the shape checks off, for profiling or a debug
 """
 
 import gc
+import inspect
 import os
 
 import pytest
@@ -33,6 +34,7 @@ def pytest_collection():
         gc.collect()
         gc.freeze()
         gc.enable()
+        gc.set_threshold(20_000, 20, 10)  # the usual 700 objects are a frame or two
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -44,6 +46,17 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _coarse_pictures():
+    """Pictures have 50 dots per inch where a test asks for no other number: they are drawn faster."""
+    from torchpose.viz._style import save_figure
+
+    plain = inspect.unwrap(save_figure)
+    before, plain.__defaults__ = plain.__defaults__, (50,)
+    yield
+    plain.__defaults__ = before
 
 
 @pytest.fixture(scope="session")
