@@ -27,6 +27,7 @@ from torchpose.io import read_recordings
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 MHAD = SKELETONS["mhad-16"].joints
+FRAMES = 26  # of a recording; completing joints takes a hundred of the persons to train on
 
 
 def recipe(recordings, n_components=2, calibration_folds=0, **options):
@@ -82,8 +83,8 @@ def data(tmp_path_factory):
     """UTD, burke and MHAD in small."""
     folder = tmp_path_factory.mktemp("data")
     names = ("s1", "s2", "s7", "s8")
-    write_people(folder / "kinect_utd_mhad", names, n_frames=40, n_sequences=2)
-    write_one(folder / "burke_kinect", 40, seed=14)
+    write_people(folder / "kinect_utd_mhad", names, n_frames=FRAMES, n_sequences=2)
+    write_one(folder / "burke_kinect", FRAMES, seed=14)
     write_mocap(folder / "mocap_berkeley_mhad", ("s1", "s9", "s10"))
     return folder
 
@@ -107,7 +108,7 @@ def test_one_line_for_each_person(left_out):
     assert table["mean", "filtered"] == pytest.approx(np.mean(errors))
     assert table["standard deviation", "filtered"] == pytest.approx(np.std(errors, ddof=1))
     frames = [table[name, "frames"] for name in persons]
-    assert frames == [40, 80, 80, 80, 80] and table["all frames", "frames"] == 360
+    assert frames == [FRAMES, *4 * [2 * FRAMES]] and table["all frames", "frames"] == 9 * FRAMES
     pooled = np.average(errors, weights=frames)
     assert table["all frames", "filtered"] == pytest.approx(pooled, rel=1e-5)
     for name in persons:
@@ -173,7 +174,7 @@ def test_copies_under_two_persons_are_refused(data, tmp_path):
     with pytest.raises(OverlapError, match="under two persons would leak"):
         learning_curve.run(
             data / "kinect_utd_mhad", tmp_path / "out", progress=False, counts=(4,),
-            more=(str(write_people(tmp_path / "copied", ("y",), 40)),),
+            more=(str(write_people(tmp_path / "copied", ("y",), FRAMES)),),
         )  # fmt: skip
 
 
@@ -255,8 +256,8 @@ def test_persons_with_one_recording_have_no_prior_of_their_own(data, tmp_path, m
 
 def test_learning_curve_of_any_recordings(data, tmp_path):
     """Folders of other names, with counts that go with the persons, and persons of a third folder."""
-    one = write_people(tmp_path / "mine" / "a", ("ann", "bob"), n_frames=40)
-    two = write_people(tmp_path / "mine" / "b", ("carl",), n_frames=40, first=2)
+    one = write_people(tmp_path / "mine" / "a", ("ann", "bob"), n_frames=FRAMES)
+    two = write_people(tmp_path / "mine" / "b", ("carl",), n_frames=FRAMES, first=2)
     report = learning_curve.run(
         [one, two], tmp_path / "out", progress=False, n_own=0, n_subsets=1, recipes=[("r", recipe)]
     )
@@ -312,7 +313,7 @@ def test_across_data_sets(data, tmp_path):
         assert cross[name, "filtered"] > 0
         assert math.isnan(cross[name, "head"])
     assert cross["UTD → MHAD, all persons", "persons"] == 3
-    assert cross["UTD → UTD (s7, s8)", "frames"] == 160
+    assert cross["UTD → UTD (s7, s8)", "frames"] == 4 * FRAMES
     assert (tmp_path / "cross-dataset.png").stat().st_size > 1000
     with pytest.raises(InputError, match="part must be"):
         cross_dataset.run(data, tmp_path, part="all")
@@ -326,8 +327,8 @@ def test_across_any_data_sets(data, tmp_path):
         write_people(tmp_path / name, persons, n_frames, first=first)
         for first, name, persons, n_frames in (
             (0, "x", "ab", 110),
-            (4, "y", "cd", 40),
-            (8, "z", "ef", 40),
+            (4, "y", "cd", FRAMES),
+            (8, "z", "ef", FRAMES),
         )
     ]
     report = cross_dataset.run(
@@ -383,8 +384,8 @@ def test_no_head_of_a_tested_person_is_learnt_from(data):
 def test_motion_capture_is_thinned_to_a_share(data):
     (recording, *_) = read_recordings(data / "kinect_utd_mhad")
     fast = replace(recording, fps=120.0)
-    assert len(cross_dataset._at_most([recording] * 10, 200)) == 5
-    assert len(cross_dataset._at_most([fast] * 10, 200)) == 10  # a quarter of the seconds
+    assert len(cross_dataset._at_most([recording] * 10, 5 * FRAMES)) == 5
+    assert len(cross_dataset._at_most([fast] * 10, 5 * FRAMES)) == 10  # a quarter of the seconds
     assert cross_dataset._at_most([recording] * 3, 10_000) == [recording] * 3
 
 

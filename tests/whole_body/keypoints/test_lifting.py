@@ -205,7 +205,7 @@ def quarter_turned(rig):
 
 
 def test_exchanged_sides_at_the_start_are_soon_forgotten():
-    joints, rig = moving_body(40), ring(1)
+    joints, rig = moving_body(30), ring(1)
     pixels = rig(joints).pixels
     mirror = [NAMES.index(other_side(name)) for name in NAMES]
     wrong = pixels.clone()
