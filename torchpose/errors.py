@@ -77,7 +77,7 @@ class PriorError(InputError):
 
 
 class NobodySeenError(InputError):
-    """Signals that no frame shows a person in the silhouettes of all cameras."""
+    """Signals that no frame shows a person: not in the silhouettes of all cameras, or not in keypoints."""
 
 
 class OverlapError(InputError):

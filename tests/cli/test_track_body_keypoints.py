@@ -17,7 +17,7 @@ from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_camera
 from torchpose.cli._body_keypoint_inputs import read_body_keypoints
 from torchpose.cli._track_body import command
 from torchpose.cli._track_body_options import check_numbers
-from torchpose.errors import InputError
+from torchpose.errors import InputError, NobodySeenError
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.skeleton._joint_sets import SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
@@ -147,6 +147,38 @@ def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
     torch.testing.assert_close(found.points[:, 1], found.points[:, 0] + 2, equal_nan=True)
     assert any("numbers 0, 5000; they are taken as simultaneous" in note for note in found.notes)
     assert any("frame 0 is number 5000" in note for note in read("elsewhere", "beside").notes)
+
+
+def nobody_in(folder, kind):
+    """An input in which a detector has found nobody."""
+    if kind == "table":
+        path = folder / "nobody.csv"
+        path.write_text("frame,name,x,y,confidence\n")
+        return path
+    path = folder / kind
+    path.mkdir()
+    if kind == "json":
+        for t in range(3):
+            (path / f"v_{t:012d}_keypoints.json").write_text(json.dumps({"people": []}))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["empty", "json", "table"])
+def test_a_camera_that_sees_nobody_is_left_out(track, scene, tmp_path, kind):
+    nobody = nobody_in(tmp_path, kind)
+    done = track(tmp_path / "out", "front_json", nobody, "behind.npz", "--pictures", "false")
+    assert done.code == 0, done.err
+    assert f"camera left is not used: {nobody}" in done.out
+    found = BodyTrack.load(tmp_path / "out" / "body.npz")
+    assert found.details["inlier"].shape[:2] == (N, 3) and not found.details["inlier"][:, 1].any()
+    assert float((found.joints3d - scene[1]).norm(dim=-1).mean()) < 0.03
+
+
+def test_inputs_without_anybody_are_refused(scene, tmp_path):
+    cameras = list(load_cameras(scene[0] / "cameras.toml").values())
+    inputs = [str(nobody_in(tmp_path, kind)) for kind in ("empty", "json", "table")]
+    with pytest.raises(NobodySeenError):
+        read_body_keypoints(inputs, cameras)
 
 
 @pytest.fixture
@@ -602,8 +634,11 @@ def test_what_does_not_go_together_is_refused(track, tmp_path, words, said):
 
 def test_bad_files_are_refused(track, torchpose, scene, tmp_path):
     folder, _, points = scene
-    (tmp_path / "empty").mkdir()
-    done = track(tmp_path / "out", tmp_path / "empty", "left.csv", "behind.npz")
+    for name in ("empty", "nothing", "none"):
+        (tmp_path / name).mkdir()
+    done = track(tmp_path / "out", *(tmp_path / name for name in ("empty", "nothing", "none")))
+    assert (done.code, "the folder is empty" in done.err) == (2, True)
+    done = track(tmp_path / "out", tmp_path / "empty", "left.mp4", "behind.mp4")
     assert (done.code, "the folder is empty" in done.err) == (2, True)
 
     wide = keypoints_of(points[:, 2], image_size=(2 * WIDTH, HEIGHT))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpose._core.terminal import show_progress
 from torchpose.cli._track import OTHER_TABLES, is_video
-from torchpose.errors import FileFormatError, InputError, SkeletonError
+from torchpose.errors import FileFormatError, InputError, NobodySeenError, SkeletonError
 from torchpose.skeleton._mediapipe_landmarks import count_given
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
 
     Raises:
         FileFormatError: a file of data that is no keypoints.
-        InputError: an input that is not there, an empty folder, keypoints beside videos without a detector,
-            or a detector without videos.
+        InputError: an input that is not there, an empty folder beside videos or nothing else, keypoints
+            beside videos without a detector, or a detector without videos.
     """
     for path in map(Path, inputs):
         if path.suffix.lower() in OTHER_TABLES and path.exists():
@@ -108,11 +108,12 @@ def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
                 f"{path}: expected keypoints of one camera as .npz, .csv or a folder of OpenPose JSON files, "
                 f"one per frame, got {path.suffix}"
             )
-        if path.is_dir() and not any(path.iterdir()):
-            raise InputError(
-                f"{path}: expected OpenPose JSON files or images, but the folder is empty"
-            )
-    videos = [path for path in inputs if is_video(path)]
+    empty = [path for path in inputs if Path(path).is_dir() and not any(Path(path).iterdir())]
+    videos = [path for path in inputs if is_video(path) and path not in empty]
+    if empty and (videos or len(empty) == len(inputs)):
+        raise InputError(
+            f"{empty[0]}: expected OpenPose JSON files or images, but the folder is empty"
+        )
     if detector is not None and not videos:
         raise InputError("--detector finds keypoints in videos, and all inputs are keypoints")
     if detector is None and 0 < len(videos) < len(inputs):
@@ -145,43 +146,79 @@ def read_body_keypoints(
 
     Raises:
         InputError, FileFormatError, SkeletonError: inputs that cannot be read, different frame rates, an
-            input of two cameras.
+            input of two cameras. NobodySeenError: no input has a keypoint.
         CameraError: images of another shape than the camera's.
     """
     from torchpose.camera._choice import fit_to_size
 
     _refuse_twice([Path(path).resolve() for path in inputs], inputs)
-    parts = [
-        _read(path, detector, fps, everybody, camera.image_size)
-        for path, camera in zip(inputs, cameras, strict=True)
-    ]
-    _refuse_twice([part.points.numpy().tobytes() for part in parts], inputs)
-    fitted = [
-        fit_to_size(camera, part.size, path)
-        for camera, part, path in zip(cameras, parts, inputs, strict=True)
-    ]
+    found, blind = _read_all(inputs, cameras, detector, fps, everybody)
+    seeing, parts = list(found), list(found.values())
+    used, delays = [inputs[c] for c in seeing], [(delays or [0] * len(inputs))[c] for c in seeing]
+    _refuse_twice([_contents(part) for part in parts], used)
+    fitted, notes_on_size = list(cameras), list[str]()
+    for c, part in found.items():
+        fitted[c], said = fit_to_size(cameras[c], part.size, inputs[c])
+        notes_on_size += said
     rates = [part.fps for part in parts if part.fps is not None] or list(other_rates)
     rate, notes = common_rate(rates, fps)
-    parts, numbered = _by_number(parts, inputs)
-    points, confidence, more = _in_step(parts, delays or [0] * len(parts), inputs)
-    notes += numbered + more + tuple(note for _, found in fitted for note in found)
+    parts, numbered = _by_number(parts, used)
+    points, confidence, more = _in_step(parts, delays, used)
+    notes += numbered + more + tuple(notes_on_size) + blind
     notes += tuple(
-        f"{path}: {n}" for path, part in zip(inputs, parts, strict=True) for n in part.notes
+        f"{path}: {n}" for path, part in zip(used, parts, strict=True) for n in part.notes
     )
-    notes += tuple(_crowd_notes(parts, cameras))
+    notes += tuple(_crowd_notes(parts, [cameras[c] for c in seeing]))
+    points = _of_all(points, seeing, len(cameras), torch.nan)
+    confidence = _of_all(confidence, seeing, len(cameras), 0.0)
     if not everybody:
         points, confidence = points[:, :, 0], confidence[:, :, 0]
-    return BodyKeypoints(points, confidence, [camera for camera, _ in fitted], rate, notes)
+    return BodyKeypoints(points, confidence, fitted, rate, notes)
+
+
+def _read_all(
+    inputs: Sequence[str],
+    cameras: "Sequence[PinholeCamera]",
+    detector: DetectorSettings | None,
+    fps: float | None,
+    everybody: bool,
+) -> tuple[dict[int, CameraKeypoints], tuple[str, ...]]:
+    """Return the keypoints of the cameras that have some, by their places, and notes on the others.
+
+    Raises:
+        NobodySeenError: no camera has one.
+    """
+    found, notes = {}, []
+    for c, (path, camera) in enumerate(zip(inputs, cameras, strict=True)):
+        try:
+            found[c] = _read(path, detector, fps, everybody, camera.image_size)
+        except NobodySeenError as error:
+            if len(notes) + 1 == len(inputs):
+                raise
+            notes.append(f"camera {camera.name} is not used: {error}")
+    return found, tuple(notes)
+
+
+def _of_all(values: Tensor, places: Sequence[int], count: int, missing: float) -> Tensor:
+    """Return values [T, S, ...] of some cameras as those of all [T, C, ...]."""
+    every = values.new_full((len(values), count, *values.shape[2:]), missing)
+    every[:, list(places)] = values
+    return every
 
 
 def _refuse_twice(values: Sequence[object], inputs: Sequence[str]) -> None:
     """Raise `InputError` where two inputs are the same one, as their values tell."""
     for i, value in enumerate(values):
-        if value in values[:i]:
+        if value is not None and value in values[:i]:
             raise InputError(
                 f"{inputs[values.index(value)]} and {inputs[i]} hold the same keypoints, which two cameras "
                 "cannot see; give each camera its own"
             )
+
+
+def _contents(part: CameraKeypoints) -> bytes | None:
+    """Return the keypoints of a camera, to be compared; None if a detector found nobody."""
+    return part.points.numpy().tobytes() if bool((part.confidence > 0).any()) else None
 
 
 def _crowd_notes(

@@ -18,7 +18,13 @@ from torchpose._core.checks import MOST_CONFIDENCE, check_pixels, check_rate
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose.camera._projection import check_intrinsics
-from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
+from torchpose.errors import (
+    CameraError,
+    FileFormatError,
+    InputError,
+    NobodySeenError,
+    SkeletonError,
+)
 from torchpose.io._formats.keypoint_files import (
     RawKeypoints,
     read_csv_keypoints,
@@ -118,7 +124,7 @@ def read_keypoints(path: str | Path, image_size: tuple[int, int] | None = None) 
         `Keypoints` with [T, J, 2] in pixels, u to the right and v down.
 
     Raises:
-        InputError: no such file, an empty sequence, nothing measured in any frame.
+        InputError: no such file. NobodySeenError: an empty sequence, nothing measured in any frame.
         FileFormatError: truncated, another kind of file, missing keys, wrong shapes, infinite
             values; the line is named where there are lines. SkeletonError: unknown joint names.
         CameraError: a `K` that is no camera matrix.
@@ -210,7 +216,7 @@ def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -
             f"{list(points.shape)}; a confidence goes into an array of its own"
         )
     if len(points) == 0:
-        raise InputError(f"{path}: the sequence is empty; expected one frame or more")
+        raise NobodySeenError(f"{path}: the sequence is empty; expected one frame or more")
     far = np.abs(points) > _FAR
     if far.any():
         frame = int(np.argwhere(far)[0, 0])
@@ -229,7 +235,7 @@ def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -
         missing |= confidence == 0
         confidence = np.where(missing, 0.0, confidence)
     if missing.all():
-        raise InputError(f"{path}: no keypoint is measured in any of {len(points)} frames")
+        raise NobodySeenError(f"{path}: no keypoint is measured in any of {len(points)} frames")
     size = _check_size(path, raw.image_size)
     points, scaled = in_pixels(path, points, missing, size or image_size)
     notes = (*raw.notes, *scaled, *_note_of_filled(int(filled.sum())))

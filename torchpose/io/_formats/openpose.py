@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchpose._core.reading import check_span, read_json, reading
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import FileFormatError, InputError, NobodySeenError
 from torchpose.skeleton._joint_sets import COCO, SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
@@ -84,8 +84,8 @@ def read_openpose(folder: str | Path) -> OpenPosePerson:
         hips are tells which it is. Of Halpe's 26 and the 133 of COCO-WholeBody the 17 of COCO are taken.
 
     Raises:
-        InputError: no such files, or nobody in any of them. FileFormatError: not OpenPose's JSON,
-            or another number of keypoints; the file is named.
+        InputError: no such files. NobodySeenError: nobody in any of them. FileFormatError: not OpenPose's
+            JSON, or another number of keypoints; the file is named.
     """
     frames, names, first = _read_frames(folder)
     table = np.zeros((len(frames), len(names), 3))
@@ -108,7 +108,7 @@ def read_openpose_people(folder: str | Path) -> OpenPosePeople:
         `OpenPosePeople`. An index says nothing about who it is.
 
     Raises:
-        InputError, FileFormatError: as `read_openpose`.
+        InputError, NobodySeenError, FileFormatError: as `read_openpose`.
     """
     frames, names, first = _read_frames(folder)
     table = np.zeros((len(frames), max(map(len, frames)), len(names), 3))
@@ -133,9 +133,8 @@ def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) 
     """Return the names of the keypoints."""
     sizes = {len(person) for person in everybody}
     if not sizes:
-        raise InputError(
-            f"{folder}: nobody was found in any of {n_frames} frames; look at what the detector wrote, and "
-            "of several cameras leave this one out"
+        raise NobodySeenError(
+            f"{folder}: nobody was found in any of {n_frames} frames; look at what the detector wrote"
         )
     if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
         raise FileFormatError(
@@ -155,6 +154,10 @@ def _files_by_frame(folder: Path) -> dict[int, Path]:
     with reading(folder, "a folder"):
         files = sorted(folder.glob(f"*{_SUFFIX}"))
     if not files:
+        if not any(folder.iterdir()):
+            raise NobodySeenError(
+                f"{folder}: the folder is empty; expected OpenPose files *{_SUFFIX}"
+            )
         raise InputError(f"{folder}: expected OpenPose files *{_SUFFIX}, found none")
     found = [re.search(r"(\d+)$", path.name.removesuffix(_SUFFIX)) for path in files]
     numbers = [int(match.group(1)) for match in found if match is not None]
