@@ -293,6 +293,19 @@ def test_what_is_no_tensor_or_not_of_one_frame_is_named(prior, few):
     ):
         with pytest.raises(InputError, match=said):
             tracker.step(state, **{"keypoints": frame, **given})
+    whole = few.new_ones(few.shape[:3])
+    for given, said in (
+        (
+            {"keypoints": few.to("meta")},
+            "keypoints must hold numbers, got a tensor on the device meta",
+        ),
+        ({"keypoints": few.to(torch.complex64)}, "keypoints must be real"),
+        ({"confidence": whole.to("meta")}, "confidence must hold numbers"),
+        ({"covariance": few.to_sparse()}, "covariance must be a dense tensor"),
+        ({"lengths": torch.ones(len(few), dtype=torch.complex64)}, "lengths must be real"),
+    ):
+        with pytest.raises(InputError, match=said):
+            tracker(**{"keypoints": few, "names": NAMES, **given})
     with pytest.raises(InputError, match="mask must be a tensor, got ndarray"):
         tracker(few, mask=mask[:, None].expand(few.shape[:3]).numpy(), names=NAMES)
     with pytest.raises(ShapeError, match=r"confidence must have shape \[3, 4\], got \[4\]"):

@@ -97,11 +97,26 @@ def refuse_half(name: str, pixels: Tensor) -> None:
 
 
 def check_tensors(**values: object) -> None:
-    """Raise `InputError` for arrays and lists in place of tensors, by their names; None may pass."""
+    """Raise `InputError` for what are no tensors of real numbers, by their names; None may pass.
+
+    Tensors on the device "meta" have a shape and no numbers. Sparse ones are not what is computed with.
+    """
     for name, value in values.items():
-        if value is not None and not isinstance(value, Tensor):
+        if value is None:
+            continue
+        if not isinstance(value, Tensor):
             raise InputError(
                 f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
+            )
+        check_real(name, value)
+        if value.is_meta:
+            raise InputError(
+                f"{name} must hold numbers, got a tensor on the device meta, which has a shape alone; make "
+                'it on a device that computes, such as "cpu"'
+            )
+        if value.layout != torch.strided:
+            raise InputError(
+                f"{name} must be a dense tensor, got {value.layout}; convert it with .to_dense()"
             )
 
 

@@ -346,15 +346,17 @@ def as_lengths(lengths: Tensor | Sequence[int]) -> Tensor:
     """Return the numbers of frames of sequences as a tensor; `check_gaps` looks at their values.
 
     Raises:
-        InputError: what holds no numbers.
+        InputError: what holds no real numbers.
     """
     try:
-        return torch.as_tensor(lengths)
+        found = torch.as_tensor(lengths)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"lengths must hold the number of frames of each sequence, got {lengths!r}; pass a tensor or a "
             "list of whole numbers"
         ) from error
+    check_tensors(lengths=found)
+    return found
 
 
 def check_gaps(

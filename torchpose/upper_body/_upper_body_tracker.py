@@ -285,6 +285,7 @@ class UpperBodyTracker(WideModule):
         """
         refuse_export(*_NO_EXPORT)
         with one_run(self.measurement_cov.device):
+            check_tensors(keypoints=keypoints)
             keypoints = check_sequences(keypoints).to(self.measurement_cov)
             picked = self._pick(keypoints.shape[2], names)
             lengths = None if lengths is None else as_lengths(lengths)
@@ -368,20 +369,15 @@ class UpperBodyTracker(WideModule):
             ShapeError, InputError: wrong shapes, infinite values, or a state of another method.
         """
         check_stream(state)
-        check_tensors(
-            keypoints=keypoints,
-            confidence=confidence,
-            mask=mask,
-            covariance=covariance,
-            absent=absent,
-        )
+        given = {"confidence": confidence, "mask": mask, "covariance": covariance, "absent": absent}
+        check_tensors(keypoints=keypoints, **given)
         sizes = [len(state.unseen), state.n_keypoints]
         check_shape("keypoints", keypoints, [*sizes, 2])
         for name, value in (("confidence", confidence), ("mask", mask)):
             if value is not None:
                 check_shape(name, value, sizes)
-        given = (None if x is None else x[:, None] for x in (confidence, mask, covariance, absent))
-        state, track = self.advance(state, keypoints[:, None], *given)
+        of_frame = (None if x is None else x[:, None] for x in given.values())
+        state, track = self.advance(state, keypoints[:, None], *of_frame)
         return state, live_pose(track, state.unseen / (self.fps or 30.0))
 
     def advance(
@@ -410,6 +406,7 @@ class UpperBodyTracker(WideModule):
         """
         refuse_export(*_NO_EXPORT)
         check_stream(state)
+        check_tensors(keypoints=keypoints)
         check_floating("keypoints", keypoints)
         refuse_half("keypoints", keypoints)
         check_shape("keypoints", keypoints, [len(state.unseen), "T", state.n_keypoints, 2])
@@ -445,6 +442,7 @@ class UpperBodyTracker(WideModule):
         absent: Tensor | None,
         picked: Picked,
     ) -> MeasuredJoints:
+        check_tensors(confidence=confidence, mask=mask, covariance=covariance, absent=absent)
         measured = in_prior_pixels(
             keypoints, confidence, mask, covariance, picked, self.prior, self.camera,
             self.measurement_cov,

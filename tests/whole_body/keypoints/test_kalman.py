@@ -585,6 +585,21 @@ def test_names_of_a_stream_hold_for_all_frames(four):
     ("changes", "error", "said"),
     [
         ({"keypoints": lambda k: k.numpy()}, InputError, "must be a tensor, got ndarray"),
+        (
+            {"keypoints": lambda k: k.to("meta")},
+            InputError,
+            "must hold numbers, got a tensor on the device meta",
+        ),
+        (
+            {"keypoints": lambda k: k.to(torch.complex64)},
+            InputError,
+            "must be real, got torch.complex64",
+        ),
+        (
+            {"confidence": lambda c: c.to_sparse()},
+            InputError,
+            "must be a dense tensor, got torch.sparse_coo",
+        ),
         ({"confidence": lambda c: 100 * c}, InputError, "divide scores in percent by 100"),
         ({"keypoints": lambda k: k.repeat(1, 1, 2, 1)}, ShapeError, "BODY_15, whose names count"),
     ],
