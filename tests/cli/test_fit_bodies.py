@@ -281,3 +281,20 @@ def test_bad_input_is_refused_in_one_line(torchpose, walks, tmp_path, line, said
     done = torchpose("fit", *line, "--out", tmp_path / "bad.safetensors")
     assert done.code == 2 and said in done.err and len(done.err.splitlines()) == 1, done.err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["limbs", "body"])
+def test_gaps_leave_the_rest_of_a_recording(kind, torchpose, walks, tmp_path):
+    for path in walks.iterdir():
+        with np.load(path) as values:
+            arrays = dict(values)
+        if path.stem == "p0_0":
+            arrays["joints"][10, 4] = np.nan
+            arrays["joints"][70:, 8] = np.nan
+        np.savez(tmp_path / path.name, **arrays)
+    out = tmp_path / "out" / "mine.safetensors"
+    done = torchpose("fit", kind, tmp_path, "--out", out, *QUICK[kind])
+    assert done.code == 0, done.err
+    assert "note: 1 frames with missing joints are interpolated" in done.out
+    assert "p0_0.npz: 10 of 80 frames are left out" in done.out
+    assert LOADERS[kind](out).info.persons == ("set#p0", "set#p1", "set#p2")

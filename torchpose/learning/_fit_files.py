@@ -13,6 +13,7 @@ from torchpose.learning._body_motion_fit import BodyMotionRecipe
 from torchpose.learning._model_card import MODES, BodyModel, body_card, model_card
 from torchpose.learning._recipes.actions import FittedActions
 from torchpose.learning._recipes.body_motion import RecordedMotion, fit_motion, motion_summary
+from torchpose.learning._recipes.gaps import notes_on_gaps
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -119,7 +120,8 @@ def write_manifold_files(
 
     pictures = {f"{Path(file).stem}.png": draw} if picture else None
     written = write_fit(manifold, body_card(manifold, file=file), results, file, pictures)
-    return f"{fitting.summary(manifold)}\n{_written(results, written)}"
+    notes = notes_on_gaps([*fitting.data.fitted, *fitting.data.held_out])
+    return f"{fitting.summary(manifold)}\n{_written(results, written, notes)}"
 
 
 def write_limb_files(
@@ -133,7 +135,7 @@ def write_limb_files(
     """
     found, held_out = fit_limbs(states, least_std, **facts)
     written = write_fit(found, body_card(found, file=file), results, file)
-    return f"{summary(found, held_out)}\n{_written(results, written)}"
+    return f"{summary(found, held_out)}\n{_written(results, written, states.notes)}"
 
 
 def write_body_files(
@@ -151,7 +153,7 @@ def write_body_files(
     """
     found, held_out = fit_motion(recorded, recipe, **facts)
     written = write_fit(found, body_card(found, file=file), results, file)
-    return f"{motion_summary(found, held_out)}\n{_written(results, written)}"
+    return f"{motion_summary(found, held_out)}\n{_written(results, written, recorded.notes)}"
 
 
 def write_action_files(
@@ -176,11 +178,13 @@ def write_action_files(
     pictures = {name: drawing(action) for name, action in names.items()} if picture else None
     card = body_card(found, facts.get("name", ""), file=file)
     written = write_fit(found, card, results, file, pictures)
-    return f"{fitted.summary()}\n{_written(results, written)}"
+    notes = notes_on_gaps(fitted.performances.recordings)
+    return f"{fitted.summary()}\n{_written(results, written, notes)}"
 
 
-def _written(results: ResultsFolder, written: Sequence[Path]) -> str:
-    return "\n".join([f"wrote {', '.join(map(str, written))}", *results.notes])
+def _written(results: ResultsFolder, written: Sequence[Path], notes: Sequence[str]) -> str:
+    said = [f"note: {note}" for note in notes]
+    return "\n".join([*said, f"wrote {', '.join(map(str, written))}", *results.notes])
 
 
 def _prior_lines(prior: UpperBodyPrior) -> list[str]:

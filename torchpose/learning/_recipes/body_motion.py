@@ -30,6 +30,7 @@ from torchpose.learning._recipes.choosing import (
     recorded_joints,
     state_of,
 )
+from torchpose.learning._recipes.gaps import notes_on_gaps, whole_pieces
 from torchpose.math._rotations import matrix_to_quaternion_vector
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
 from torchpose.skeleton._joint_sets import canonical_names
@@ -41,7 +42,7 @@ class RecordedMotion:
 
     Attributes:
         fps: most frames per second of the sequences. train, watched: of each recording, `watched` those of
-            persons who are held out. fitted, held_out: the recordings.
+            persons who are held out. fitted, held_out: the recordings, cut at long gaps. notes: on these.
     """
 
     fps: float
@@ -49,6 +50,7 @@ class RecordedMotion:
     watched: list[MotionSequence]
     fitted: list[Recording]
     held_out: list[Recording]
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def gather(
@@ -77,6 +79,8 @@ class RecordedMotion:
         learnt, watched = choose_recordings(
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
+        learnt, left_out = whole_pieces(learnt)
+        watched, more = whole_pieces(watched)
         both, n = [*learnt, *watched], len(learnt)
         rates = [min(fps, r.fps or fps) for r in both]
         joints = [recorded_joints(r, rate) for r, rate in zip(both, rates, strict=True)]
@@ -99,7 +103,8 @@ class RecordedMotion:
                     _set_of(recording),
                 )
             )  # fmt: skip
-        return cls(fps, found[:n], found[n:], learnt, watched)
+        notes = (*notes_on_gaps(both), *left_out, *more)
+        return cls(fps, found[:n], found[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:
         """Return frame rate and digests of the recordings, equal for equal fits."""

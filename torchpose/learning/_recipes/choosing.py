@@ -20,6 +20,7 @@ from torchpose.io._formats.axes import Axes
 from torchpose.io._mocap import resample_frames
 from torchpose.io._recordings import Recording, find_recordings, read_recordings
 from torchpose.learning._curation.splits import pick_persons, refuse_shared_recordings
+from torchpose.learning._recipes.gaps import LONGEST_GAP, fill_short_gaps, missing_joints
 
 
 class ChosenRecordings(NamedTuple):
@@ -89,20 +90,23 @@ def recording_name(recording: Recording) -> str:
 def recorded_joints(recording: Recording, fps: float) -> Tensor:
     """Return joints [T, 15, 3] of the body at a frame rate; those that are never there are NaN.
 
+    Gaps of up to 0.2 s are filled (`fill_short_gaps`).
+
     Raises:
-        InputError: no frame rate in the file, or a joint that is missing in some frames.
+        InputError: no frame rate in the file, or a joint that is missing for longer.
     """
     name = recording_name(recording)
     if recording.fps is None:
         raise InputError(f"{name}: the file does not say its frame rate, which is needed")
     joints = body_joints(recording.joints, recording.names)
-    missing = joints.isnan().any(-1)
-    gaps = (missing & ~missing.all(0)).nonzero()
+    joints = fill_short_gaps(joints, recording.fps)
+    gaps = missing_joints(joints).nonzero()
     if len(gaps):
         frame, joint = gaps[0].tolist()
         raise InputError(
-            f"{recording.path or name}: {BODY_15.names[joint]} is missing in frame {frame}; end the "
-            "recording there, fill the gap, or leave the file out"
+            f"{recording.path or name}: {BODY_15.names[joint]} is missing in frame {frame}, in a gap of more "
+            f"than {LONGEST_GAP:g} s or at an end; cut the recording there, fill the gap, or leave the file "
+            "out"
         )
     return resample_frames(joints, recording.fps, fps)
 

@@ -30,6 +30,7 @@ from torchpose.learning._recipes.choosing import (
     recorded_joints,
     state_of,
 )
+from torchpose.learning._recipes.gaps import notes_on_gaps, whole_pieces
 from torchpose.math._rotations import compose, conjugate
 from torchpose.priors._limb_conditionals import LimbConditionals
 
@@ -41,7 +42,7 @@ class LimbStates:
     Attributes:
         body: whose frame and centres the states have. fps: the frame rate of the states.
         train, watched: [T, D] for each recording, `watched` those of persons who are held out.
-        fitted, held_out: the recordings.
+        fitted, held_out: the recordings, cut at long gaps. notes: on these.
     """
 
     body: Body
@@ -50,6 +51,7 @@ class LimbStates:
     watched: list[Tensor]
     fitted: list[Recording]
     held_out: list[Recording]
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def gather(
@@ -76,6 +78,8 @@ class LimbStates:
         learnt, watched = choose_recordings(
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
+        learnt, left_out = whole_pieces(learnt)
+        watched, more = whole_pieces(watched)
         both = [*learnt, *watched]
         joints, n = [recorded_joints(r, fps) for r in both], len(learnt)
         bodies = body_of_each(both, joints, frame="body")
@@ -87,7 +91,8 @@ class LimbStates:
         centred = {person: body.altered(centres=centres) for person, body in bodies.items()}
         # fitted again, since the twist that joints do not tell is zero about the centres
         states = [state_of(centred[r.person_id], r, j) for r, j in zip(both, joints, strict=True)]
-        return cls(centred[first], fps, states[:n], states[n:], learnt, watched)
+        notes = (*notes_on_gaps(both), *left_out, *more)
+        return cls(centred[first], fps, states[:n], states[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:
         """Return frame rate and digests of the recordings, equal for equal fits."""

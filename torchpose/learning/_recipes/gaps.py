@@ -1,0 +1,129 @@
+"""Fill short gaps of recordings, and cut recordings at long ones: motion is fitted to whole bodies."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.body._skeleton import body_joints
+from torchpose.errors import InputError
+from torchpose.io._recordings import Recording
+
+LONGEST_GAP = 0.2
+"""Seconds from one whole frame to the next, up to which joints that are missing between are interpolated."""
+_SHORTEST_PIECE = 0.5  # seconds of a recording between long gaps; shorter ones tell no motion
+_ROUNDING = 1e-6  # of that time
+
+
+def missing_joints(joints: Float[Tensor, "T J 3"]) -> Bool[Tensor, "T J"]:
+    """Return which joints are missing, other than those that the recording never has."""
+    missing = joints.isnan().any(-1)
+    return missing & ~missing.all(0)
+
+
+def fill_short_gaps(joints: Float[Tensor, "T J 3"], fps: float) -> Float[Tensor, "T J 3"]:
+    """Return joints without gaps of up to 0.2 s, which are filled by cubic Hermite pieces.
+
+    Whole frames at the times t_k are the knots, with slopes m_k by differences of second order:
+
+        p(t) = h00 p_k + h10 d m_k + h01 p_(k+1) + h11 d m_(k+1),   d = t_(k+1) - t_k
+
+    Args:
+        joints: metres, NaN where missing. fps: frames per second.
+    """
+    missing = missing_joints(joints)
+    whole = ~missing.any(-1)
+    if bool(whole.all()) or int(whole.sum()) < 2:
+        return joints
+    knots = whole.nonzero().squeeze(-1)
+    time = torch.arange(len(joints), device=joints.device)
+    after = torch.searchsorted(knots, time).clamp(1, len(knots) - 1)
+    first, last = knots[after - 1], knots[after]
+    d = last - first
+    short = (first < time) & (time < last) & (d <= LONGEST_GAP * fps * (1 + _ROUNDING))
+    points = joints[knots]
+    slopes = torch.gradient(points, spacing=(knots.to(points),), dim=0)[0]
+    s, d = (((time - first) / d).to(points)[:, None, None], d.to(points)[:, None, None])
+    filled = (
+        (2 * s**3 - 3 * s**2 + 1) * points[after - 1]
+        + (s**3 - 2 * s**2 + s) * d * slopes[after - 1]
+        + (3 * s**2 - 2 * s**3) * points[after]
+        + (s**3 - s**2) * d * slopes[after]
+    )
+    return torch.where((missing & short[:, None])[..., None], filled, joints)
+
+
+def whole_pieces(recordings: Sequence[Recording]) -> tuple[list[Recording], tuple[str, ...]]:
+    """Return recordings cut where joints are missing for longer, and notes on what was left out.
+
+    Pieces of less than half a second are left out, too.
+
+    Raises:
+        InputError: nothing is left of a recording.
+    """
+    pieces, notes = [], []
+    for recording in recordings:
+        runs = _whole_runs(recording)
+        length = sum(stop - start for start, stop in runs)
+        if not runs:
+            raise InputError(
+                f"{_file_of(recording)}: no half a second in which all joints are there that the recording "
+                "has; leave the file out"
+            )
+        if length == len(recording):
+            pieces.append(recording)
+            continue
+        pieces += [_cut(recording, start, stop) for start, stop in runs]
+        notes.append(
+            f"{_file_of(recording)}: {len(recording) - length} of {len(recording)} frames are left out, in "
+            f"or beside gaps of more than {LONGEST_GAP:g} s"
+        )
+    return pieces, tuple(notes)
+
+
+def notes_on_gaps(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return a note if joints of recordings are interpolated, with the number of their frames."""
+    counts = [int(missing_joints(_body(r)).any(-1).sum()) for r in recordings]
+    if not any(counts):
+        return ()
+    first = next(r for r, count in zip(recordings, counts, strict=True) if count)
+    several = sum(count > 0 for count in counts)
+    where = _file_of(first) + (f" and {several - 1} more" if several > 1 else "")
+    return (
+        f"{sum(counts)} frames with missing joints are interpolated, in gaps of up to {LONGEST_GAP:g} s: "
+        f"{where}",
+    )
+
+
+def _whole_runs(recording: Recording) -> list[tuple[int, int]]:
+    """Return first frames and ends of the stretches without a long gap."""
+    if recording.fps is None:
+        return [(0, len(recording))]
+    filled = fill_short_gaps(_body(recording), recording.fps)
+    whole = ~missing_joints(filled).any(-1)
+    if bool(whole.all()):
+        return [(0, len(recording))]
+    edges = torch.nn.functional.pad(whole.int(), (1, 1)).diff()
+    starts, stops = ((edges == sign).nonzero().squeeze(-1) for sign in (1, -1))
+    long = stops - starts >= _SHORTEST_PIECE * recording.fps
+    return list(zip(starts[long].tolist(), stops[long].tolist(), strict=True))
+
+
+def _cut(recording: Recording, start: int, stop: int) -> Recording:
+    weights = recording.weights
+    return replace(
+        recording,
+        joints=recording.joints[start:stop],
+        weights=None if weights is None else weights[start:stop],
+        first_frame=recording.first_frame + start,
+    )
+
+
+def _body(recording: Recording) -> Float[Tensor, "T 15 3"]:
+    return body_joints(recording.joints, recording.names)
+
+
+def _file_of(recording: Recording) -> str:
+    return str(recording.path or recording.person_id)
