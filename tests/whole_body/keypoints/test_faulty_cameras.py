@@ -16,6 +16,7 @@ from tests.whole_body.keypoints.scenes import (
     scene,
 )
 from torchpose import BodyTracker
+from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import rotvec_to_matrix
@@ -31,11 +32,17 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
     looked_at_again,
     without_still,
 )
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    KeypointFrame,
+    RigMaps,
+    exchange_of,
+)
 from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_a_rolled_camera,
     notes_on_cameras_now,
 )
+from torchpose.whole_body._keypoints.mirrored_cameras import notes_on_mirrored_cameras
 from torchpose.whole_body._keypoints.turn_looks import _mean_turn
 from torchpose.whole_body._keypoints.turned_cameras import (
     angles_of,
@@ -306,6 +313,36 @@ def test_another_order_of_the_inputs_is_said(order):
     for camera, given in enumerate(order):
         assert f"input {camera + 1} is of c{given}" in note
     assert notes_on_order(names, maps, right) == ()
+
+
+@pytest.mark.parametrize("cameras", [3, 4])
+@pytest.mark.parametrize("exchanged", [True, False])
+def test_one_mirrored_camera_is_said(cameras, exchanged):
+    seen = scene(cameras, n_frames=14)
+    keypoints = seen.keypoints + torch.tensor([90.0, 0.0])  # not in the middle
+    rig = copy.deepcopy(seen.rig)
+    rig.matrix[:, 0, 2] += 90
+    mirrored = keypoints.clone()
+    mirrored[:, 1, :, 0] = 1919 - keypoints[:, 1, :, 0]
+    if exchanged:
+        mirror = exchange_of(BODY_15, torch.device("cpu")).mirror
+        mirrored[:, 1] = mirrored[:, 1, mirror]
+    notes = track(mirrored, rig).notes
+    assert "the video of camera c1 seems to be mirrored" in notes[0]
+    assert not any("seems to have begun" in note for note in notes)
+
+
+def test_right_and_turned_cameras_are_not_called_mirrored(three):
+    filter = BodyTracker(three.rig, "kalman", fps=FPS).by_keypoints.tracker.filter
+    sides = filter.exchange.mirror
+    behind = three.keypoints.clone()
+    behind[::4, 1] = behind[::4, 1, sides]  # sides that a detector exchanges
+    turned_rig = with_turn(three.rig, 1, 20.0)
+    for rig, keypoints in ((three.rig, three.keypoints), (three.rig, behind), (turned_rig, behind)):
+        single = KeypointBodyTracker(rig, FPS)
+        frames = single.reader.frames(keypoints, None, NAMES, None)
+        maps = single.tracker.filter.maps
+        assert notes_on_mirrored_cameras(rig, maps, frames, filter.exchange) == ()
 
 
 def test_a_rolled_camera_by_itself_is_said():

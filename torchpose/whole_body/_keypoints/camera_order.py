@@ -24,8 +24,7 @@ def notes_on_order(names: Sequence[str], maps: RigMaps, frames: KeypointFrame) -
     Args:
         names: of the cameras. maps: of them. frames: keypoints [T, C, J].
     """
-    stride = max(1, -(-len(frames.pixels) // _FRAMES))
-    orders, agreed = agreement_of_orders(maps, frames.map(lambda value: value[::stride]))
+    orders, agreed = agreement_of_orders(maps, some_frames(frames))
     first, second = agreed.topk(2).values.tolist()
     best = int(agreed.argmax())
     if best == 0 or first < max(WELL, agreed[0] + MORE):
@@ -49,9 +48,21 @@ def agreement_of_orders(
     """
     count = some.pixels.shape[1]
     orders = list(permutations(range(count))) if count <= _EVERY_ORDER else _exchanges(count)
-    tried = some.map(lambda value: value[:, torch.tensor(orders)].flatten(0, 1))
-    good, seen = (v.unflatten(0, (-1, len(orders))).sum(0) for v in agreement_of_each(maps, tried))
-    return orders, good / seen.clamp_min(1)
+    return orders, agreement_of_readings(maps, some.map(lambda v: v[:, torch.tensor(orders)]))
+
+
+def agreement_of_readings(maps: RigMaps, tried: KeypointFrame) -> Float[Tensor, " N"]:
+    """Return how well cameras agree by each of N readings of keypoints [T, N, C, J]."""
+    count = tried.pixels.shape[1]
+    flat = tried.map(lambda value: value.flatten(0, 1))
+    good, seen = (v.unflatten(0, (-1, count)).sum(0) for v in agreement_of_each(maps, flat))
+    return good / seen.clamp_min(1)
+
+
+def some_frames(frames: KeypointFrame) -> KeypointFrame:
+    """Return frames [T, ...] of all, few enough to try several readings."""
+    stride = max(1, -(-len(frames.pixels) // _FRAMES))
+    return frames.map(lambda value: value[::stride])
 
 
 def _exchanges(count: int) -> list[tuple[int, ...]]:

@@ -29,6 +29,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
+from torchpose.whole_body._keypoints.mirrored_cameras import notes_on_mirrored_cameras
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
@@ -135,11 +136,12 @@ class TrackBuilder:
             return notes + rolled
         if len(self.rig) == 1 or not cameras:
             return notes
-        order = notes_on_order(self.rig.names, self.tracker.filter.maps, frame)
+        maps, exchange = self.tracker.filter.maps, self.tracker.filter.exchange
+        order = notes_on_order(self.rig.names, maps, frame)
+        order = order or notes_on_mirrored_cameras(self.rig, maps, frame, exchange)
         if order:
             return (*order, *notes)
         rig = self.rig if refined is None else refined.rig
-        exchange = self.tracker.filter.exchange
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
         if turned:  # that is said already
             doubts = doubts._replace(turns=torch.zeros_like(doubts.turns))
