@@ -22,7 +22,7 @@ from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
 from torchpose.whole_body import BodyTrack, BodyTracker
 from torchpose.whole_body._keypoints.camera_bundle import CameraErrors, by_pose, corrected_pose
 from torchpose.whole_body._keypoints.camera_refinement import DELAY, _corrected
-from torchpose.whole_body._keypoints.coarse_delays import coarse_delays, shifted
+from torchpose.whole_body._keypoints.coarse_delays import coarse_delays, shifted, shifted_flags
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
 T = 32
@@ -149,6 +149,41 @@ def test_a_rotation_leaves_a_camera_in_its_place(right):
     torch.testing.assert_close(*places)
     small = torch.eye(3, dtype=torch.float64) + 1e-6 * cross_matrix(values[0, :3])
     torch.testing.assert_close(rotvec_to_matrix(1e-6 * values[0, :3]), small)
+
+
+def test_poses_stay_as_given_where_delays_explain_all(late, in_step):
+    found = track(late, refine="both")
+    given = late.rig.translation
+    torch.testing.assert_close(found.details["camera_translation"][0], given, atol=1e-12, rtol=0)
+    torch.testing.assert_close(found.details["camera_delays"], in_step.details["camera_delays"])
+    assert mean_error(found, late) < 0.01
+    assert any("poses as given" in note for note in found.notes)
+    assert not any("was turned by" in note for note in found.notes)
+
+
+def test_a_camera_that_is_left_out_since_it_is_late_is_used_again():
+    rig, seen = ring(3), [jumping(-delay / FPS) for delay in (0, 8, 0)]
+    pixels = torch.stack([rig(joints).pixels[:, c] for c, joints in enumerate(seen)], 1)
+    given = Scene(seen[0], rig, pixels + 1.0, torch.full_like(pixels[..., 0], 0.9))
+    before, found = track(given), track(given, refine="delays")
+    assert any("camera c1 was left out" in note for note in before.notes)
+    assert not any("was left out" in note for note in found.notes)
+    assert float(found.details["inlier"][2:-10, 1].mean()) > 0.9
+    assert float(found.details["camera_delays"][0, 1]) == pytest.approx(8.0, abs=0.2)
+
+
+def jumping(phase: float) -> torch.Tensor:
+    """Joints [T, 15, 3] of a person who jumps about."""
+    t = torch.arange(T, dtype=torch.float64) / FPS + phase
+    way = torch.stack([(4.4 * t).sin(), (6.3 * t).sin().abs(), (4.4 * t).cos()], -1)
+    return moving_body(T, phase=phase) + 0.8 * way[:, None]
+
+
+def test_flags_are_moved_as_their_frames_are():
+    flags = torch.zeros(8, 2, dtype=torch.bool)
+    flags[5:7, 1] = True
+    moved = shifted_flags(flags, torch.tensor([0, 3]))
+    assert moved[:, 1].nonzero().flatten().tolist() == [2, 3] and not moved[:, 0].any()
 
 
 # --- what is right, and what nobody asked for ---------------------------------------------------------

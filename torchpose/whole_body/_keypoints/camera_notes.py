@@ -112,12 +112,17 @@ def notes_on_refined(names: Sequence[str], refined: RefinedCameras, what: str) -
             f"refine={what!r} found nothing that explains the keypoints better: cameras as given",
         )
     values, std = refined.errors.values, refined.errors.std
+    posed = what != "delays" and bool((values[:, :DELAY] != 0).any())
     notes = []
+    if what == "both" and not posed:
+        notes.append(
+            f"refine={what!r} found no poses of cameras that explain the keypoints better: poses as given"
+        )
     for c, name in enumerate(names):
         parts = []
         if what != "extrinsics" and c > 0:
             parts.append(f"began {_in_words(values[c, DELAY], std[c, DELAY])} than {names[0]}")
-        if what != "delays":
+        if posed:
             turn, shift = values[c, :3].norm(), 100 * values[c, 3:DELAY].norm()
             parts.append(
                 f"was turned by {_rounded(torch.rad2deg(turn), torch.rad2deg(std[c, :3].norm()), 2)} degrees "

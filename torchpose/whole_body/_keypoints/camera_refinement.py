@@ -6,6 +6,9 @@ joints are adjusted to the keypoints together (`camera_bundle`). At the end the 
 and with the corrected cameras. The corrected ones are kept if they raise the log-evidence of the filter by
 more than they cost.
 
+Keypoints that delays explain are explained by delays with wrong poses as well, which move the body in the
+room. So where both are estimated, poses stay as given unless they raise the log-evidence, too.
+
 Where tracking has found one camera that is turned and others that are not, all this begins with it turned,
 and its corrections are about that. From the calibration as given the turn would be spread over all cameras.
 """
@@ -16,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
@@ -64,6 +67,7 @@ class RefinedCameras(NamedTuple):
         errors: of the cameras as they were given; zero where those are kept. rig: without their errors.
         frames: keypoints in time with the first camera. poses: of the body, [1, T, ...].
         gain: log-evidence for the corrected cameras against the given ones. kept: whether those stay.
+        what: which errors were estimated, one of `REFINED`.
     """
 
     errors: CameraErrors
@@ -72,6 +76,7 @@ class RefinedCameras(NamedTuple):
     poses: KeypointPoses
     gain: float
     kept: bool
+    what: str
 
 
 def refine_cameras(
@@ -115,13 +120,30 @@ def _refined(
     smoothing: bool,
 ) -> RefinedCameras:
     """Return cameras without errors about those of a rig."""
-    errors, free = CameraErrors.none(rig), free_errors(len(rig), what)
     before = track(rig, frames, True)
+    found = _refined_from(before, rig, frames, track, fps, what, exchange, smoothing)
+    if what == "both":
+        late = _refined_from(before, rig, frames, track, fps, "delays", exchange, smoothing)
+        if found.gain < late.gain + _LEAST_GAIN:
+            return late
+    return found
+
+
+def _refined_from(
+    before: KeypointPoses,
+    rig: CameraRig,
+    frames: KeypointFrame,
+    track: Track,
+    fps: float,
+    what: str,
+    exchange: Exchange,
+    smoothing: bool,
+) -> RefinedCameras:
+    """Return cameras without some kinds of errors about those of a rig, with which the body was tracked."""
+    errors, free = CameraErrors.none(rig), free_errors(len(rig), what)
     poses, adjusted = before, None
     if bool(free[:, DELAY].any()):
-        longest = max(_LEAST_LONGEST, round(_LONGEST * fps))
-        longest = min(longest, max(1, len(frames.pixels) // 3))
-        errors.values[:, DELAY] = coarse_delays(rig, frames, longest).to(errors.values)
+        errors.values[:, DELAY] = whole_delays(rig, frames, fps).to(errors.values)
     for i in range(_ROUNDS):
         if i > 0 or bool(errors.values.any()):
             known = poses.joints[0] if i > 0 else None
@@ -140,10 +162,20 @@ def _refined(
     after = track(better, moved, smoothing)
     gain = _gain(frames, before, after, errors.values[:, DELAY].round()) - adjusted.price
     if gain > _LEAST_GAIN:
-        return RefinedCameras(errors, better, moved, after, gain, kept=False)
+        return RefinedCameras(errors, better, moved, after, gain, kept=False, what=what)
     before = before if smoothing else track(rig, frames, False)
     same = CameraErrors(torch.zeros_like(errors.values), errors.cov)
-    return RefinedCameras(same, rig, frames, before, gain, kept=True)
+    return RefinedCameras(same, rig, frames, before, gain, kept=True, what=what)
+
+
+def whole_delays(rig: CameraRig, frames: KeypointFrame, fps: float) -> Int[Tensor, " C"]:
+    """Return whole frames by which cameras began too early, against the first one; up to 0.3 s.
+
+    Args:
+        rig: the cameras. frames: keypoints [T, C, J]. fps: frames per second.
+    """
+    longest = max(_LEAST_LONGEST, round(_LONGEST * fps))
+    return coarse_delays(rig, frames, min(longest, max(1, len(frames.pixels) // 3)))
 
 
 def details_of_cameras(found: RefinedCameras, count: int) -> dict[str, Tensor]:

@@ -3,7 +3,7 @@
 from itertools import combinations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
@@ -107,9 +107,19 @@ def shifted(
         frames: [T, C, J]. delays: whole frames.
         beyond: factor of the trust in the first and last keypoints, which stand for those before and after.
     """
-    count = len(frames.pixels)
-    rows = torch.arange(count, device=delays.device)[:, None]
-    places = (rows + delays).clamp(0, count - 1)
+    rows, places = _places(len(frames.pixels), delays)
     moved = frames.map(lambda value: value[places, torch.arange(len(delays))])
     trust = torch.where(places == rows + delays, 1.0, beyond).to(moved.inlier)
     return moved._replace(inlier=moved.inlier * trust[..., None]), places - rows
+
+
+def shifted_flags(flags: Bool[Tensor, "T C"], delays: Int[Tensor, " C"]) -> Bool[Tensor, "T C"]:
+    """Return flags of camera c of frame t + delay; those of the first and last stand for others beyond."""
+    places = _places(len(flags), delays)[1]
+    return flags[places, torch.arange(len(delays))]
+
+
+def _places(count: int, delays: Int[Tensor, " C"]) -> tuple[Int[Tensor, "T 1"], Int[Tensor, "T C"]]:
+    """Return frames t, and t + delay within the sequence."""
+    rows = torch.arange(count, device=delays.device)[:, None]
+    return rows, (rows + delays).clamp(0, count - 1)

@@ -33,8 +33,10 @@ from torchpose.whole_body._keypoints.camera_refinement import (
     details_of_cameras,
     in_time,
     refine_cameras,
+    whole_delays,
 )
 from torchpose.whole_body._keypoints.camera_units import check_units
+from torchpose.whole_body._keypoints.coarse_delays import shifted, shifted_flags
 from torchpose.whole_body._keypoints.faulty_cameras import LEAST_CAMERAS, without_still_frames
 from torchpose.whole_body._keypoints.foot_filter import FootFilter, FootGaussian, FootPoses
 from torchpose.whole_body._keypoints.foot_tracker import step_feet, track_feet
@@ -57,7 +59,7 @@ from torchpose.whole_body._keypoints.known_person import (
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.track_builder import TrackBuilder, without_poses
-from torchpose.whole_body._keypoints.turned_cameras import angles_of
+from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
 T = TypeVar("T")
 SMOOTHING = ("none", "full")
@@ -297,7 +299,7 @@ class KeypointBodyTracker(nn.Module):
             moved = moved.map(lambda value: value[None])
             return tracker(moved, smooth, progress, waited=math.inf, watch=False)
 
-        used, off, turn = self._of_right_cameras(frames)
+        used, off, turn = self._of_right_cameras(frames, late=refine in ("delays", "both"))
         single = used.map(lambda value: value[0])
         found = refine_cameras(
             self.rig, single, track, self.fps, refine, former.exchange, smoothing, turn
@@ -316,20 +318,29 @@ class KeypointBodyTracker(nn.Module):
         return replace(result, notes=notes, details={**result.details, **details})
 
     def _of_right_cameras(
-        self, frames: KeypointFrame
+        self, frames: KeypointFrame, late: bool
     ) -> tuple[KeypointFrame, Bool[Tensor, "1 T C"], Float[Tensor, "C 3 3"] | None]:
         """Return keypoints [1, T, C, J] of cameras that see the person, which do not, and their turns.
 
         Small errors of cameras are estimated from all keypoints, so a video that stands still, or of
-        something else, would move the cameras that are right. So would one that is turned by much.
+        something else, would move the cameras that are right. So would one that is turned by much. A camera
+        that is late looks like these, so delays are tried first where they are looked for.
         """
-        used = without_still_frames(frames.map(lambda value: value[0]))
-        used = used.map(lambda value: value[None])
+        single = without_still_frames(frames.map(lambda value: value[0]))
+        used = single.map(lambda value: value[None])
         if len(self.rig) < LEAST_CAMERAS:
             return used, torch.zeros_like(used.inlier[..., 0], dtype=torch.bool), None
         poses = self.tracker(frames, waited=math.inf)
-        used = used._replace(inlier=used.inlier.masked_fill(poses.off[..., None], 0.0))
-        return used, poses.off, poses.turn[0, -1]
+        off, turn = poses.off[0], poses.turn[0, -1]
+        if late and bool(off.any() | is_turned(turn).any()):
+            delays = whole_delays(self.rig, single, self.fps)
+            moved = shifted(single, delays)[0].map(lambda value: value[None])
+            again = self.tracker(moved, waited=math.inf)
+            off_again = shifted_flags(again.off[0], -delays)
+            if _n_wrong(off_again, again.turn[0, -1]) < _n_wrong(off, turn):
+                off, turn = off_again, again.turn[0, -1]
+        used = used._replace(inlier=used.inlier.masked_fill(off[None, ..., None], 0.0))
+        return used, off[None], turn
 
     def _refined_feet(
         self, feet: KeypointFrame | None, found: RefinedCameras, smoothing: bool
@@ -342,6 +353,11 @@ class KeypointBodyTracker(nn.Module):
         moved = in_time(self.rig, single, found.errors.values, found.poses.joints[0][:, ankles])
         frames = moved.map(lambda value: value[None])
         return track_feet(self.feet, RigMaps.of(found.rig), found.poses, frames, smoothing)
+
+
+def _n_wrong(off: Bool[Tensor, "T C"], turn: Float[Tensor, "C 3 3"]) -> float:
+    """Return how many cameras are left out, of all frames on average, or turned at the end."""
+    return float((off | is_turned(turn)).double().mean(0).sum())
 
 
 def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -> None:
