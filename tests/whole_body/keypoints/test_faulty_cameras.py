@@ -21,6 +21,7 @@ from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import (
     _corrected,
     _one_after_another,
@@ -42,7 +43,6 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_a_rolled_camera,
     notes_on_cameras_now,
 )
-from torchpose.whole_body._keypoints.mirrored_cameras import notes_on_mirrored_cameras
 from torchpose.whole_body._keypoints.turn_looks import _mean_turn
 from torchpose.whole_body._keypoints.turned_cameras import (
     angles_of,
@@ -328,8 +328,18 @@ def test_one_mirrored_camera_is_said(cameras, exchanged):
         mirror = exchange_of(BODY_15, torch.device("cpu")).mirror
         mirrored[:, 1] = mirrored[:, 1, mirror]
     notes = track(mirrored, rig).notes
-    assert "the video of camera c1 seems to be mirrored" in notes[0]
+    assert (
+        notes[0].startswith("camera c1: ")
+        and "of this camera alone, the images are mirrored" in notes[0]
+    )
     assert not any("seems to have begun" in note for note in notes)
+
+
+def test_one_camera_with_images_of_another_size_is_said(three):
+    keypoints = three.keypoints.clone()
+    keypoints[:, 2] = (keypoints[:, 2] + 0.5) / 2 - 0.5
+    notes = track(keypoints, three.rig).notes
+    assert notes[0].startswith("camera c2: ") and "keypoints are of images of 1/2" in notes[0]
 
 
 def test_right_and_turned_cameras_are_not_called_mirrored(three):
@@ -342,7 +352,7 @@ def test_right_and_turned_cameras_are_not_called_mirrored(three):
         single = KeypointBodyTracker(rig, FPS)
         frames = single.reader.frames(keypoints, None, NAMES, None)
         maps = single.tracker.filter.maps
-        assert notes_on_mirrored_cameras(rig, maps, frames, filter.exchange) == ()
+        assert notes_on_one_camera(rig, maps, frames, filter.exchange) == ()
 
 
 def test_a_rolled_camera_by_itself_is_said():

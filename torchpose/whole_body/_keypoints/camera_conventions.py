@@ -23,13 +23,15 @@ from torchpose.whole_body._keypoints.camera_units import log_factors
 from torchpose.whole_body._keypoints.joint_triangulation import agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
+WELL_OF_TWO = 0.9
+"""In place of WELL where there are two cameras, which agree more easily."""
 _FRAMES = 12  # that are looked at, at most
 _LEAST_KEYPOINTS = 24  # in these frames, of joints that two cameras see
 _LEAST_BONES = 20  # in all images, that tell a size
 _SURE = 0.92  # agreement from which on nothing else is tried, unless the person is upside down
-_WELL_OF_TWO = 0.9  # in place of WELL where there are two cameras, which agree more easily
 _MOST_TRUNKS = 0.8  # share of images that show the trunk the same way
 _LITTLE = 0.02  # by how much cameras have to agree better on one who is not upside down
+_TIE = 0.01  # exchanged inputs of two cameras, one of which is the world's axes, look like an inverted pose
 _SIZES = (0.4, 1.6)  # of a person, by what is expected
 _MOST = 0.99  # share of the keypoints that is in the images
 _SCALES = ((1, 3), (1, 2), (2, 3), (3, 2), (2, 1), (3, 1))  # of images by the calibrated ones
@@ -37,7 +39,7 @@ _SCALES = ((1, 3), (1, 2), (2, 3), (3, 2), (2, 1), (3, 1))  # of images by the c
 _Pixels = Callable[[Tensor], Tensor]
 
 
-class _Convention(NamedTuple):
+class Convention(NamedTuple):
     """Holds another reading of what is given.
 
     Attributes:
@@ -45,6 +47,7 @@ class _Convention(NamedTuple):
         rotation, translation: of the cameras [C, 3, 3], [C, 3].
         pixels: the change of keypoints [..., C, J, 2].
         tilts: whether what is up in images is not up in these.
+        exchanges: whether a detector that sees the images takes left for right.
     """
 
     said: str
@@ -53,6 +56,7 @@ class _Convention(NamedTuple):
     translation: Tensor
     pixels: _Pixels | None = None
     tilts: bool = False
+    exchanges: bool = False
 
 
 def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
@@ -77,8 +81,13 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
     if human and given > _SURE and not upside_down:
         return
     found = []
-    least = _WELL_OF_TWO if len(rig) == 2 else WELL
-    for convention in (*_conventions(rig), *_of_sizes(rig, some)):
+    least = WELL_OF_TWO if len(rig) == 2 else WELL
+    conventions = (
+        *_of_poses(rig.rotation, rig.translation),
+        *_of_images(rig),
+        *_of_sizes(rig, some),
+    )
+    for convention in conventions:
         if above and convention.tilts:
             continue
         maps = _maps(rig, filter.maps, convention.rotation, convention.translation)
@@ -92,11 +101,13 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
     if not found:
         return
     best, convention = max(found, key=lambda pair: pair[0])
-    if float(agreement_of_orders(filter.maps, some)[1].max()) > best:
+    ordered = float(agreement_of_orders(filter.maps, some)[1].max())
+    if ordered > best:
         return  # a note tells of the order
+    or_order = ", or inputs are in another order than the cameras" if ordered > best - _TIE else ""
     raise CameraError(
         f"cameras agree on {100 * given:.0f} % of the keypoints as they are given, and on {100 * best:.0f} % "
-        f"if {convention.said}; {convention.advice}"
+        f"if {convention.said}{or_order}; {convention.advice}"
     )
 
 
@@ -125,26 +136,31 @@ def _maps(rig: CameraRig, maps: RigMaps, rotation: Tensor, translation: Tensor) 
     return maps._replace(matrix=turned, shift=shift, centre=-torch.linalg.solve(turned, shift))
 
 
-def _conventions(rig: CameraRig) -> Iterator[_Convention]:
-    """Yield all known conventions but the own one."""
+def image_conventions(rig: CameraRig) -> Iterator[Convention]:
+    """Yield the other readings of keypoints in images."""
+    yield from _of_images(rig)
+    yield from (_of_size(rig, one, of) for one, of in _SCALES)
+
+
+def _of_images(rig: CameraRig) -> Iterator[Convention]:
+    """Yield the conventions of images of the calibrated size."""
     R, t = rig.rotation, rig.translation
-    yield from _of_poses(R, t)
-    yield _Convention(
+    yield Convention(
         "keypoints are v, u, a row and a column", "give u, v: u to the right and v down", R, t,
         lambda pixels: pixels.flip(-1), True,
     )  # fmt: skip
     if None in rig.sizes:
         return
     h, w = torch.tensor(rig.sizes).to(R).T[..., None]
-    yield _Convention(
+    yield Convention(
         "v is counted from the lower edge of the image", "give height - 1 - v, which is down", R, t,
         lambda p: torch.stack([p[..., 0], h - 1 - p[..., 1]], -1), True,
     )  # fmt: skip
-    yield _Convention(
+    yield Convention(
         "the images are mirrored",
         "give keypoints of images as they were calibrated, u = width - 1 - u (and exchange left and right if "
         "a detector found them in mirrored images)",
-        R, t, lambda p: torch.stack([w - 1 - p[..., 0], p[..., 1]], -1),
+        R, t, lambda p: torch.stack([w - 1 - p[..., 0], p[..., 1]], -1), False, True,
     )  # fmt: skip
     turns: dict[str, _Pixels] = {
         "upside down": lambda p: torch.stack([w - 1 - p[..., 0], h - 1 - p[..., 1]], -1),
@@ -154,40 +170,40 @@ def _conventions(rig: CameraRig) -> Iterator[_Convention]:
         ),
     }
     for turn, pixels in turns.items():
-        yield _Convention(
+        yield Convention(
             f"the images are {turn} against the calibrated ones",
             "turn the images, or their keypoints, back, or calibrate the turned images",
             R, t, pixels, True,
         )  # fmt: skip
 
 
-def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[_Convention]:
+def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[Convention]:
     """Yield the sizes of images in which keypoints can be: all lie inside, and in no smaller image of these.
 
     Two cameras close together tell sizes poorly, so only those that the keypoints themselves speak for count.
     """
-    if None in rig.sizes:
-        return
-    sides = torch.tensor(rig.sizes).to(some.pixels).flip(-1)[:, None]
+    sides = (
+        (2 * rig.matrix[:, :2, 2] + 1).clamp_min(1).to(some.pixels)[:, None]
+    )  # as matrices have them
     used = float((some.pixels / sides).amax(-1)[some.inlier > 0].quantile(_MOST))
     for one, of in _SCALES:
         s = one / of
         if (s < 1 and used > s) or (s > 1 and used < 1):
             continue
-        yield _Convention(
-            f"keypoints are of images of {one}/{of} of the calibrated size",
-            f"give the calibration of these images: the first two rows of `matrix` and `size` times "
-            f"{one}/{of}, or give keypoints of the calibrated images (.npz and .csv may state image_size)",
-            rig.rotation, rig.translation, _divided(s),
-        )  # fmt: skip
+        yield _of_size(rig, one, of)
 
 
-def _divided(factor: float) -> _Pixels:
-    """Return the change of pixels of images that are larger by a factor to those of the calibrated ones."""
-    return lambda pixels: (pixels + 0.5) / factor - 0.5
+def _of_size(rig: CameraRig, one: int, of: int) -> Convention:
+    """Return the convention of images that are larger than the calibrated ones by a factor."""
+    return Convention(
+        f"keypoints are of images of {one}/{of} of the calibrated size",
+        f"give the calibration of these images: the first two rows of `matrix` and `size` times "
+        f"{one}/{of}, or give keypoints of the calibrated images (.npz and .csv may state image_size)",
+        rig.rotation, rig.translation, lambda pixels: (pixels + 0.5) * of / one - 0.5,
+    )  # fmt: skip
 
 
-def _of_poses(R: Float[Tensor, "C 3 3"], t: Float[Tensor, "C 3"]) -> Iterator[_Convention]:
+def _of_poses(R: Float[Tensor, "C 3 3"], t: Float[Tensor, "C 3"]) -> Iterator[Convention]:
     """Yield the conventions of poses R, t of cameras."""
     flip = torch.tensor([1.0, -1.0, -1.0]).to(R)
 
@@ -195,24 +211,24 @@ def _of_poses(R: Float[Tensor, "C 3 3"], t: Float[Tensor, "C 3"]) -> Iterator[_C
         return -(turn @ point[..., None]).squeeze(-1)
 
     opengl = "cameras look along -z with y up, as those of OpenGL and Blender"
-    yield _Convention(
+    yield Convention(
         "poses are those from camera to world",
         "a camera file has those from world to camera: the rotation R^T and the translation -R^T t",
         R.mT, moved(R.mT, t),
     )  # fmt: skip
-    yield _Convention(
+    yield Convention(
         "translations are the places of the cameras", "a camera at c has the translation -R c", R,
         moved(R, t),
     )  # fmt: skip
-    yield _Convention(
+    yield Convention(
         "rotations are those from camera to world, and translations are not",
         "give the rotations R^T, of Rodrigues vectors with the other sign", R.mT, t,
     )  # fmt: skip
-    yield _Convention(
+    yield Convention(
         opengl, "give the rotation F R and the translation F t, with F = diag(1, -1, -1)",
         flip[:, None] * R, flip * t,
     )  # fmt: skip
-    yield _Convention(
+    yield Convention(
         f"{opengl}, and poses are those from camera to world",
         "give the rotation F R^T and the translation -F R^T t, with F = diag(1, -1, -1)",
         flip[:, None] * R.mT, moved(flip[:, None] * R.mT, t),

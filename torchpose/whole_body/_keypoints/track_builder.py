@@ -14,6 +14,7 @@ from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_notes import doubt_cameras, notes_on_cameras
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import RefinedCameras
 from torchpose.whole_body._keypoints.foot_filter import FootPoses
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
@@ -29,7 +30,6 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
-from torchpose.whole_body._keypoints.mirrored_cameras import notes_on_mirrored_cameras
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
@@ -138,7 +138,7 @@ class TrackBuilder:
             return notes
         maps, exchange = self.tracker.filter.maps, self.tracker.filter.exchange
         order = notes_on_order(self.rig.names, maps, frame)
-        order = order or notes_on_mirrored_cameras(self.rig, maps, frame, exchange)
+        order = order or notes_on_one_camera(self.rig, maps, frame, exchange)
         if order:
             return (*order, *notes)
         rig = self.rig if refined is None else refined.rig

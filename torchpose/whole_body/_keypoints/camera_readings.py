@@ -1,0 +1,71 @@
+"""Say what is wrong with the images of one camera: read in another way, they let cameras agree on joints."""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from torchpose.camera._rig import CameraRig
+from torchpose.whole_body._keypoints.camera_conventions import (
+    WELL_OF_TWO,
+    Convention,
+    image_conventions,
+)
+from torchpose.whole_body._keypoints.camera_order import (
+    MORE,
+    WELL,
+    agreement_of_readings,
+    some_frames,
+)
+from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame, RigMaps
+
+
+def notes_on_one_camera(
+    rig: CameraRig, maps: RigMaps, frames: KeypointFrame, exchange: Exchange
+) -> tuple[str, ...]:
+    """Return a note if cameras agree far better with the images of one of them read in another way.
+
+    Args:
+        rig, maps: the cameras. frames: keypoints [T, C, J]. exchange: of sides.
+    """
+    least = WELL_OF_TWO if len(rig) == 2 else WELL
+    some = some_frames(frames)
+    given = float(agreement_of_readings(maps, some.map(lambda value: value[:, None]))[0])
+    if given > 1 - MORE:
+        return ()
+    readings = list(_readings(rig, some, exchange))
+    tried = [_one_by_one(some, other) for _, other in readings]
+    side_by_side = KeypointFrame(*(torch.cat(values, 1) for values in zip(*tried, strict=True)))
+    best, place = agreement_of_readings(maps, side_by_side).max(0)
+    if float(best) < max(least, given + MORE):
+        return ()
+    convention, name = readings[int(place) // len(rig)][0], rig.names[int(place) % len(rig)]
+    return (
+        f"camera {name}: cameras agree on {100 * float(best):.0f} % of the keypoints if, of this camera "
+        f"alone, {convention.said}, and on {100 * given:.0f} % as they are given, so poses may be wrong; "
+        f"{convention.advice}",
+    )
+
+
+def _readings(
+    rig: CameraRig, some: KeypointFrame, exchange: Exchange
+) -> Iterator[tuple[Convention, KeypointFrame]]:
+    """Yield the other readings of images, each with the keypoints of all cameras read so."""
+    for convention in image_conventions(rig):
+        if convention.pixels is None:
+            continue
+        other = some._replace(pixels=convention.pixels(some.pixels))
+        yield convention, other
+        if convention.exchanges:
+            yield convention, other.map(lambda value: value.index_select(2, exchange.mirror))
+
+
+def _one_by_one(some: KeypointFrame, other: KeypointFrame) -> KeypointFrame:
+    """Return keypoints [T, C, C, J] with those of each camera, one after the other, replaced."""
+    own = torch.eye(some.pixels.shape[1], dtype=torch.bool, device=some.pixels.device)
+
+    def put(value: Tensor, new: Tensor) -> Tensor:
+        chosen = own.view(*own.shape, *[1] * (value.ndim - 2))
+        return torch.where(chosen, new[:, None], value[:, None])
+
+    return KeypointFrame(*map(put, some, other))
