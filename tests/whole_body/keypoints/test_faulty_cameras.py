@@ -20,6 +20,7 @@ from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.whole_body._keypoints.all_sides import notes_on_all_sides
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
 from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import (
@@ -333,6 +334,20 @@ def test_one_mirrored_camera_is_said(cameras, exchanged):
         and "of this camera alone, the images are mirrored" in notes[0]
     )
     assert not any("seems to have begun" in note for note in notes)
+
+
+@pytest.mark.parametrize("cameras", [2, 3])
+def test_sides_that_are_exchanged_in_all_cameras_are_said(cameras):
+    seen = scene(cameras, n_frames=12)
+    single = KeypointBodyTracker(seen.rig, FPS)
+    frames = single.reader.frames(seen.keypoints, seen.confidence, NAMES, None)
+    filter = single.tracker.filter
+    assert notes_on_all_sides(filter, frames) == ()
+    nobody = frames._replace(inlier=0 * frames.inlier)
+    assert notes_on_all_sides(filter, nobody) == ()
+    mirror = filter.exchange.mirror
+    notes = track(seen.keypoints[:, :, mirror], seen.rig).notes
+    assert "left and right seem to be exchanged in all cameras" in notes[0]
 
 
 def test_one_camera_with_images_of_another_size_is_said(three):

@@ -12,6 +12,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.all_sides import notes_on_all_sides
 from torchpose.whole_body._keypoints.camera_notes import doubt_cameras, notes_on_cameras
 from torchpose.whole_body._keypoints.camera_order import notes_on_order
 from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
@@ -138,6 +139,7 @@ class TrackBuilder:
             return notes
         maps, exchange = self.tracker.filter.maps, self.tracker.filter.exchange
         order = notes_on_order(self.rig.names, maps, frame)
+        notes = (*notes_on_all_sides(self.tracker.filter, frame), *notes)
         order = order or notes_on_one_camera(self.rig, maps, frame, exchange)
         if order:
             return (*order, *notes)
