@@ -156,15 +156,15 @@ def read_body_keypoints(
     seeing, parts = list(found), list(found.values())
     used, delays = [inputs[c] for c in seeing], [(delays or [0] * len(inputs))[c] for c in seeing]
     _refuse_twice([_contents(part) for part in parts], used)
-    fitted, notes_on_size = list(cameras), list[str]()
+    fitted, sizes = list(cameras), list[str]()
     for c, part in found.items():
         fitted[c], said = fit_to_size(cameras[c], part.size, inputs[c])
-        notes_on_size += said
+        sizes += said
     rates = [part.fps for part in parts if part.fps is not None] or list(other_rates)
     rate, notes = common_rate(rates, fps)
     parts, numbered = _by_number(parts, used)
     points, confidence, more = _in_step(parts, delays, used)
-    notes += numbered + more + tuple(notes_on_size) + blind
+    notes += numbered + more + tuple(sizes) + blind
     notes += tuple(
         f"{path}: {n}" for path, part in zip(used, parts, strict=True) for n in part.notes
     )
@@ -188,7 +188,8 @@ def _read_all(
     Raises:
         NobodySeenError: no camera has one.
     """
-    found, notes = {}, []
+    found: dict[int, CameraKeypoints] = {}
+    notes: list[str] = []
     for c, (path, camera) in enumerate(zip(inputs, cameras, strict=True)):
         try:
             found[c] = _read(path, detector, fps, everybody, camera.image_size)

@@ -1,5 +1,6 @@
 """Say if left and right are exchanged in all cameras: no person then stands so, and knees bend forwards."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -8,6 +9,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_start import start
 
 _FRAMES = 8  # at most, in which a body begins by each reading
+_AT_A_TIME = 4  # of these, which bounds the memory
 _LEAST_JOINTS = 10  # that two cameras see, of a frame that tells
 _LEAST_GAIN = 20.0  # log-evidence of exchanged sides, of all frames together
 
@@ -35,5 +37,10 @@ def evidence_of_exchanged(filter: BodyKalmanFilter, frames: KeypointFrame) -> Fl
     rows = rows[:: max(1, -(-len(rows) // _FRAMES))]
     some = frames.take(rows)
     other = some.map(lambda value: value.index_select(2, filter.exchange.mirror))
-    own, exchanged = (start(filter, one).log_evidence for one in (some, other))
-    return exchanged - own
+    return _evidence(filter, other) - _evidence(filter, some)
+
+
+def _evidence(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:
+    """Return the log-evidence of bodies that begin in each of the frames."""
+    parts = zip(*(value.split(_AT_A_TIME) for value in frames), strict=True)
+    return torch.cat([start(filter, KeypointFrame(*part)).log_evidence for part in parts])
