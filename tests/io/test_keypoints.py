@@ -10,7 +10,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.data import data_dir_or_skip
-from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
+from torchpose.errors import (
+    CameraError,
+    FileFormatError,
+    InputError,
+    NobodySeenError,
+    SkeletonError,
+)
 from torchpose.io import Keypoints, read_keypoints, write_keypoints
 from torchpose.io._formats.openpose import _BODY_25B, read_openpose_people
 from torchpose.skeleton import SKELETONS
@@ -497,6 +503,9 @@ def test_files_without_numbers_and_old_key(tmp_path):
 
 
 def test_bad_openpose_folders(tmp_path):
+    with pytest.raises(NobodySeenError, match="the folder is empty"):
+        read_keypoints(tmp_path)
+    (tmp_path / "notes.txt").write_text("of something else")
     with pytest.raises(InputError, match="found none"):
         read_keypoints(tmp_path)
     frame(tmp_path / "nobody", 0)

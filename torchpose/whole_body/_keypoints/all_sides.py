@@ -9,7 +9,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_start import start
 
 _FRAMES = 8  # at most, in which a body begins by each reading
-_AT_A_TIME = 4  # of these, which bounds the memory
+_AT_A_TIME = 3  # of these, which bounds the memory
 _LEAST_JOINTS = 10  # that two cameras see, of a frame that tells
 _LEAST_GAIN = 20.0  # log-evidence of exchanged sides, of all frames together
 
