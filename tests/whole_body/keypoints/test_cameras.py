@@ -173,10 +173,10 @@ def test_a_camera_that_is_left_out_since_it_is_late_is_used_again():
 
 
 def jumping(phase: float) -> torch.Tensor:
-    """Joints [T, 15, 3] of a person who jumps about."""
-    t = torch.arange(T, dtype=torch.float64) / FPS + phase
+    """Joints [40, 15, 3] of a person who jumps about."""
+    t = torch.arange(40, dtype=torch.float64) / FPS + phase
     way = torch.stack([(4.4 * t).sin(), (6.3 * t).sin().abs(), (4.4 * t).cos()], -1)
-    return moving_body(T, phase=phase) + 0.8 * way[:, None]
+    return moving_body(40, phase=phase) + 0.8 * way[:, None]
 
 
 def test_flags_are_moved_as_their_frames_are():
