@@ -21,10 +21,9 @@ from torchpose.evaluation._person_tables import (
     add_pose_classes,
     class_error,
     mean_error,
-    pooled,
 )
 from torchpose.evaluation._trials import Recipe, add_picture
-from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, pooled, run_jobs
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior
 

@@ -57,6 +57,21 @@ def test_errors_are_those_of_the_tracker_and_of_the_mean_pose(folder, prior, sco
         assert found == pytest.approx(float(wanted[j]), rel=1e-5)
 
 
+def test_recordings_are_tracked_at_their_own_rates(folder, tmp_path) -> None:
+    """Of one person at two rates, all frames have the errors of both recordings by themselves."""
+    prior = load_prior("kinect-upper-body-small")
+    slow, fast = folder / "b_a01_t0.npz", tmp_path / "fast.npz"
+    arrays = dict(np.load(folder / "c_a01_t0.npz")) | {"subject": "b", "fps": 120.0}
+    np.savez(fast, **arrays)
+    options = {"prior": prior, "method": "window-mixture", "progress": False}
+    apart = [
+        float(score.run(path, tmp_path / path.stem, **options)["persons"]["b", "filtered"])
+        for path in (slow, fast)
+    ]
+    both = score.run([slow, fast], tmp_path / "both", **options)["persons"]["b", "filtered"]
+    assert both == pytest.approx(np.mean(apart), rel=1e-5)
+
+
 def test_every_joint_has_its_row(scored) -> None:
     report, out = scored
     table = report["joints"]

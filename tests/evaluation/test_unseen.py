@@ -11,7 +11,7 @@ from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.evaluation import _person_recordings as persons_module
 from torchpose.evaluation import _unseen as unseen
 from torchpose.evaluation._completion import with_wrists
-from torchpose.evaluation._person_tables import mean_error, pooled
+from torchpose.evaluation._person_tables import mean_error
 from torchpose.evaluation._trials import CAMERA, centred_on_neck, make_test_set, track
 from torchpose.io import read_recordings
 from torchpose.metrics import joint_errors_3d
@@ -61,6 +61,20 @@ def test_scores_are_those_of_tracker_and_metrics(persons, prior):
     left, right = arm_states(torch.cat(sequences), views, prior.info.matrix)
     both = torch.stack([prior.left.log_prob(left), prior.right.log_prob(right)])
     torch.testing.assert_close(found.log_likelihood, both.mean(0))
+
+
+def test_sequences_are_tracked_at_their_own_rates(persons, prior, tmp_path):
+    """The scores of a person at two rates are those of both recordings by themselves."""
+    (slow,) = persons["s10"]
+    both = [slow, replace(slow, fps=60.0)]
+    known = persons["s1"] + persons["s2"]
+    job = unseen.Job("s10", known, {"s10": both}, {"seed": 0, "n_components": 2}, small_recipe)
+    (found,) = unseen.run_jobs([job], tmp_path)
+    fitted = small_recipe(known, 2)
+    sequences = unseen.poses_to_score([slow], fitted, known)
+    apart = [unseen.score_person(fitted, sequences, rate, job.test) for rate in (30.0, 60.0)]
+    torch.testing.assert_close(found["s10"].filtered, torch.cat([one.filtered for one in apart]))
+    assert not apart[0].filtered.equal(apart[1].filtered)
 
 
 def test_a_joint_that_does_not_count_changes_nothing(persons, prior):
@@ -184,7 +198,7 @@ def test_pooled_frames_and_spread(persons, prior):
         )
         for group in persons.values()
     ]
-    whole = pooled(parts)
+    whole = unseen.pooled(parts)
     assert len(whole.filtered) == sum(len(p.filtered) for p in parts)
     assert mean_error(whole) == pytest.approx(sum(map(mean_error, parts)) / 3, rel=1e-4)
     assert persons_module.spread([1.0, 3.0, float("nan")]) == (2.0, pytest.approx(2**0.5))

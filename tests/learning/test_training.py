@@ -9,13 +9,17 @@ import torch
 
 from tests.priors.poses import lowered_neck, poses, recording
 from torchpose.camera import ViewRange, lift
+from torchpose.demo import performer
 from torchpose.errors import InputError, PriorError
 from torchpose.learning import TRAINING_VIEWS
-from torchpose.learning._recipes import UpperBodyRecipe
+from torchpose.learning._recipes import UpperBodyRecipe, calibration
+from torchpose.learning._recipes.calibration import MODES, _seen, track_held_out
 from torchpose.learning._samplers import all_samples
 from torchpose.learning._training import arm_sources, collect_poses, short_paths
 from torchpose.math import euler_to_matrix as rotate
+from torchpose.metrics import align
 from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import UpperBodyTracker
 
 Fitted = namedtuple("Fitted", "left right facts")
 NECK = UPPER_BODY.index("neck")
@@ -87,6 +91,47 @@ def test_facts_name_persons_sources_and_frame_rate():
     assert facts["persons"] == ("#b", "site:set#a", "site:set#b") or len(facts["persons"]) == 3
     assert "site:set@1" in facts["sources"]
     assert facts["fps"] == 25.0 and facts["neck"] == "neck" and facts["hand"] == "hand"
+
+
+def test_rates_of_jittering_time_stamps_count_as_one():
+    stamped = [recording(poses(10), fps=30.0 + 0.01 * i) for i in range(6)]
+    facts = collect_poses([*stamped, recording(poses(20), fps=120.0)]).facts
+    assert facts["fps"] == pytest.approx(30.0, abs=0.06)
+
+
+def test_held_out_persons_are_tracked_at_the_rates_of_their_recordings(monkeypatch):
+    """A person who is recorded at both rates has the errors of both recordings by themselves."""
+    people = [recording(film(40, seed), f"p{seed}") for seed in range(3)]
+    recipe = UpperBodyRecipe(
+        n_components=2, n_samples=400, pose_steps=3, window_components=2, window_samples=200,
+        window_steps=2, calibration_folds=0,
+    )  # fmt: skip
+    prior = recipe.fit(people)
+    slow, fast = recording(film(45, 5), "new"), recording(film(90, 7, 60.0), "new", fps=60.0)
+
+    def held_out(*recordings, drawn=0):
+        poses_of = recipe.poses([*people, *recordings])
+        return track_held_out(prior, poses_of, {recordings[0].person_id}, 0, drawn)
+
+    both, apart = held_out(slow, fast), (held_out(slow), held_out(fast))
+    for mode in MODES:
+        wanted = torch.cat([part[mode].errors for part in apart])
+        torch.testing.assert_close(both[mode].errors, wanted)
+    test = recipe.poses([fast])
+    keypoints, truth, inside = _seen(prior, [test.joints], 0)
+    track = UpperBodyTracker(
+        prior, prior.camera, calibrated=False, fps=60.0, method="window-mixture"
+    )
+    found = align(track(keypoints, lengths=inside.sum(1)).joints3d[0], truth[0]).points - truth[0]
+    torch.testing.assert_close(apart[1]["causal"].errors, found)
+    monkeypatch.setattr(calibration, "DRAWN", {"mkf_sampled": {"method": "mkf-sampled"}})
+    monkeypatch.setattr(calibration, "_SHORT", 20)
+    assert len(held_out(fast, drawn=1)["mkf_sampled"].errors) == 40  # as long as 20 of the prior
+
+
+def film(n_frames, seed, fps=30.0):
+    """The performer of the demonstration, in front of the camera."""
+    return performer(n_frames, fps=fps, seed=seed).body.double()
 
 
 def test_low_necks_are_converted():

@@ -10,10 +10,9 @@ from torchpose.evaluation._person_tables import (
     SHORT_NAMES,
     add_pose_classes,
     mean_error,
-    pooled,
 )
 from torchpose.evaluation._report import Report
-from torchpose.evaluation._unseen import Scored
+from torchpose.evaluation._unseen import Scored, pooled
 
 
 class Crossed(NamedTuple):

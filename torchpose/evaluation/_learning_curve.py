@@ -32,11 +32,10 @@ from torchpose.evaluation._person_tables import (
     add_pose_classes,
     mean_error,
     plot_curves,
-    pooled,
 )
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
-from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, pooled, run_jobs
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior

@@ -1,24 +1,19 @@
 """Tables and pictures of the protocols over persons."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
 
 from torchpose.evaluation._person_recordings import POSE_CLASSES, spread
 from torchpose.evaluation._report import Report, Table
-from torchpose.evaluation._unseen import Scored
+from torchpose.evaluation._unseen import Scored, pooled
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 SHORT_NAMES = tuple(name.replace("_left", " L").replace("_right", " R") for name in UPPER_BODY)
 """Names of the joints at the heads of columns."""
 
 _HANDS, _ELBOWS = (0, 7), (1, 6)
-
-
-def pooled(parts: Sequence[Scored]) -> Scored:
-    """Return all frames of several persons as one."""
-    return Scored(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def mean_error(scored: Scored, smoothed: bool = False) -> float:

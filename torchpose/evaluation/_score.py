@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -29,7 +28,6 @@ from torchpose.evaluation._person_tables import (
     add_pose_classes,
     mean_error,
     plot_persons,
-    pooled,
 )
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import (
@@ -45,7 +43,8 @@ from torchpose.evaluation._unseen import (
     Scored,
     compare,
     log_likelihood,
-    poses_to_score,
+    pooled,
+    poses_by_rate,
 )
 from torchpose.io._recordings import Recording
 from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
@@ -55,7 +54,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator_table import METHODS, choose_method, method_options
 
 _SEEN = {"head+hands": MEASURED, "all": UPPER_BODY}
-_DEFAULT_RATE = 30.0
 
 
 class _PersonScores(NamedTuple):
@@ -178,30 +176,31 @@ def _score(
     noise_std: float,
     seed: int,
 ) -> _PersonScores:
-    """Track the recordings of a person, filtered and, where the method can, smoothed.
+    """Track the recordings of a person, filtered and, where the method can, smoothed, at their own rates.
 
     A neck of another kind than the prior's is neither measured nor scored, as there is no telling
     where the prior would have it.
     """
-    poses = poses_to_score(recordings, prior, None, name)
     same_neck = all(r.upper_body().neck == prior.info.neck for r in recordings)
-    rates = [float(r.fps or prior.info.fps or _DEFAULT_RATE) for r in recordings]
     left_out = () if same_neck else ("neck",)
     names = tuple(joint for joint in names if joint not in left_out)
-    test = make_test_set(poses, CAMERA, float(np.median(rates)), seed, noise_std, names=names)
     counted = torch.tensor([joint not in left_out for joint in UPPER_BODY])
-    filtered, inside = _tracked(prior, test, counted, method, seed)
-    smoothed = torch.full_like(filtered, torch.nan)
-    if method is None or METHODS[method].smooths:
-        smoothed, _ = _tracked(prior, test, counted, method, seed, smoothing="full")
-    truth = torch.cat(list(poses)).double()
-    likelihood = torch.full((len(truth),), torch.nan, dtype=torch.float64)
-    if same_neck:
-        likelihood = log_likelihood(prior, truth, seed)
-    scored = Scored(
-        filtered.float(), smoothed.float(), inside.float(), likelihood, pose_classes(truth)
-    )
-    return _PersonScores(scored, _mean_pose_errors(prior, truth, counted), same_neck)
+    parts, baselines = [], []
+    for fps, poses in poses_by_rate(recordings, prior, None, name).items():
+        test = make_test_set(poses, CAMERA, fps, seed, noise_std, names=names)
+        filtered, inside = _tracked(prior, test, counted, method, seed)
+        smoothed = torch.full_like(filtered, torch.nan)
+        if method is None or METHODS[method].smooths:
+            smoothed, _ = _tracked(prior, test, counted, method, seed, smoothing="full")
+        truth = torch.cat(poses).double()
+        likelihood = torch.full((len(truth),), torch.nan, dtype=torch.float64)
+        if same_neck:
+            likelihood = log_likelihood(prior, truth, seed)
+        parts.append(Scored(
+            filtered.float(), smoothed.float(), inside.float(), likelihood, pose_classes(truth)
+        ))  # fmt: skip
+        baselines.append(_mean_pose_errors(prior, truth, counted))
+    return _PersonScores(pooled(parts), torch.cat(baselines), same_neck)
 
 
 def _tracked(

@@ -11,12 +11,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.frame_rates import group_by_rate
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
 from torchpose.evaluation._person_recordings import LEAST_FRAMES, complete_pieces, pose_classes
@@ -36,6 +36,7 @@ from torchpose.evaluation._trials import (
 )
 from torchpose.io._recordings import Recording
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.learning._training import DEFAULT_RATE
 from torchpose.metrics._calibration import chi2_quantile, mahalanobis_squared
 from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
 from torchpose.priors._arm_state import arm_states
@@ -88,6 +89,11 @@ class Scored(NamedTuple):
     inside: Float[Tensor, "N L 8"]
     log_likelihood: Float[Tensor, " N"]
     classes: Int[Tensor, "N 2"]
+
+
+def pooled(parts: Sequence[Scored]) -> Scored:
+    """Return all frames of several persons, or of several frame rates, as one."""
+    return Scored(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -179,9 +185,22 @@ def _scored(prior: UpperBodyPrior, job: Job, name: str, folder: Path, progress: 
     recordings = job.tests[name]
     prior.check_unseen({r.person_id for r in recordings})
     chosen = recordings[:: job.test.every]
-    poses = poses_to_score(chosen, prior, job.train, name)
-    rates = [float(r.fps or prior.info.fps or 30.0) for r in chosen]
-    fps = float(np.median(rates))
+    parts = [
+        _scored_at(prior, job, fps, poses, folder, progress)
+        for fps, poses in poses_by_rate(chosen, prior, job.train, name).items()
+    ]
+    return pooled(parts)
+
+
+def _scored_at(
+    prior: UpperBodyPrior,
+    job: Job,
+    fps: float,
+    poses: Sequence[Float[Tensor, "T 8 3"]],
+    folder: Path,
+    progress: bool,
+) -> Scored:
+    """Return the scores of sequences at one frame rate, read from the folder if they are there."""
     facts = ["scores 1", repr(job.test), fps, *prior.state_dict().values(), *poses]
     path = folder / f"scores-{settings_hash(facts)}.npz"
     found: Scored | None = read_kept(path, Scored, Scored._fields)
@@ -271,6 +290,19 @@ def poses_to_score(
 ) -> list[Float[Tensor, "T 8 3"]]:
     """Return complete sequences with the prior's neck, centred on it.
 
+    As `poses_by_rate`, of all frame rates in the order of the recordings.
+    """
+    return [piece for own in _pieces(recordings, prior, train, name) for piece in own]
+
+
+def poses_by_rate(
+    recordings: Sequence[Recording],
+    prior: UpperBodyPrior,
+    train: Sequence[Recording] | None,
+    name: str = "",
+) -> dict[float, list[Float[Tensor, "T 8 3"]]]:
+    """Return complete sequences with the prior's neck, centred on it, by their frames per second.
+
     Frames with a missing joint cut a recording in two, and pieces below ten frames are left out. A
     neck of another kind is put where the training recordings have theirs (`learn_neck_offset`).
 
@@ -282,6 +314,24 @@ def poses_to_score(
     Raises:
         PriorError: another kind of hand than the prior's. InputError: no complete frames.
     """
+    pieces = _pieces(recordings, prior, train, name)
+    rates = [
+        float(r.fps or prior.info.fps or DEFAULT_RATE)
+        for r, own in zip(recordings, pieces, strict=True)
+        if own
+    ]
+    pieces = [own for own in pieces if own]
+    groups = group_by_rate(rates)
+    return {rate: [piece for i in group for piece in pieces[i]] for rate, group in groups.items()}
+
+
+def _pieces(
+    recordings: Sequence[Recording],
+    prior: UpperBodyPrior,
+    train: Sequence[Recording] | None,
+    name: str,
+) -> list[list[Tensor]]:
+    """Return the sequences of each recording, as `poses_by_rate` has them."""
     bodies = [r.upper_body() for r in recordings]
     hands = {body.hand for body in bodies} - {prior.info.hand}
     if hands:
@@ -297,8 +347,8 @@ def poses_to_score(
         if train is not None and body.neck != prior.info.neck:
             offset = offset or training_neck(train, str(prior.info.neck))
             joints = place_neck(joints, offset)
-        found += [centred_on_neck(piece) for piece in complete_pieces(joints)]
-    if not found:
+        found.append([centred_on_neck(piece) for piece in complete_pieces(joints)])
+    if not any(found):
         raise InputError(
             f"{name}: no {LEAST_FRAMES} frames in a row have all eight joints; a test needs some"
         )

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.frame_rates import group_by_rate
 from torchpose.camera._projection import project
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
@@ -340,13 +341,16 @@ def _origin(recording: RecordingLike) -> str:
 
 
 def _frame_rate(recordings: Sequence[RecordingLike], joints: Sequence[Tensor]) -> float | None:
-    """Return the frame rate of most frames."""
+    """Return the frame rate of most frames; those that differ by 5 % at most count as one."""
+    stated = [(float(r.fps), len(j)) for r, j in zip(recordings, joints, strict=True) if r.fps]
+    if not stated:
+        return None
+    groups = group_by_rate([rate for rate, _ in stated])
+    most = max(groups.values(), key=lambda group: sum(stated[i][1] for i in group))
     frames: dict[float, int] = {}
-    for recording, poses in zip(recordings, joints, strict=True):
-        if recording.fps:
-            rate = round(float(recording.fps), 3)
-            frames[rate] = frames.get(rate, 0) + len(poses)
-    return max(frames, key=lambda rate: frames[rate], default=None)
+    for rate, count in (stated[i] for i in most):
+        frames[round(rate, 3)] = frames.get(round(rate, 3), 0) + count
+    return max(frames, key=lambda rate: frames[rate])
 
 
 def _centred(joints: Tensor, centre: str) -> Tensor:

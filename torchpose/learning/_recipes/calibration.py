@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from torchpose._core.frame_rates import group_by_rate, same_rate
 from torchpose.errors import InputError
-from torchpose.learning._training import PoseSet, seen_keypoints
+from torchpose.learning._training import DEFAULT_RATE, PoseSet, seen_keypoints
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.metrics._pose_errors import align
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -35,8 +36,9 @@ DRAWN = {
 
 _VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
 _FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
-_PIECE = 300  # frames at most, so that one long recording does not pad all others
-_SHORT = 60  # frames of a piece for the filters that draw
+# Frames at the prior's rate; pieces at other rates last as long.
+_PIECE = 300  # at most, so that one long recording does not pad all others
+_SHORT = 60  # for the filters that draw
 _NOISE = 3.0  # pixels
 
 
@@ -85,42 +87,74 @@ def track_held_out(
 ) -> dict[str, HeldOut]:
     """Track recordings of some persons in every way that the prior allows, and score complete frames.
 
+    Each recording is tracked at its own frame rate.
+
     Args:
         prior: fitted without these persons. poses: of everybody, centred as the prior's are.
         persons: whose recordings are tracked. seed: the seed of viewpoints, noise and what filters draw.
         drawn_pieces: pieces of recordings, of 60 frames at most, for the ways in `DRAWN`.
     """
+    usual = float(prior.info.fps or DEFAULT_RATE)
+    recorded = zip(poses.joints.split(poses.lengths), poses.persons, poses.rates, strict=True)
     pieces = [
-        (piece, person)
-        for sequence, person in zip(poses.joints.split(poses.lengths), poses.persons, strict=True)
+        _Piece(joints, person, rate)
+        for sequence, person, rate in recorded
         if person in persons
-        for piece in sequence.split(_PIECE)
+        for joints in sequence.split(_frames(_PIECE, rate, usual))
     ]
     pieces = pieces[:: max(1, len(pieces) // _SEQUENCES)]
     if not pieces:
         return {}
-    usual = {mode: s for mode, s in MODES.items() if mode == "pose" or mode in prior.windows}
-    found = _track(prior, pieces, usual, seed)
+    modes = {mode: s for mode, s in MODES.items() if mode == "pose" or mode in prior.windows}
+    found = _track(prior, pieces, modes, seed)
     if drawn_pieces:
         step = max(1, len(pieces) // drawn_pieces)
-        few = [(piece[:_SHORT], person) for piece, person in pieces[::step][:drawn_pieces]]
+        few = [
+            piece._replace(joints=piece.joints[: _frames(_SHORT, piece.rate, usual)])
+            for piece in pieces[::step][:drawn_pieces]
+        ]
         found |= _track(prior, few, DRAWN, seed)
     return found
 
 
+class _Piece(NamedTuple):
+    """Holds joints [T, 8, 3] of a part of a recording, whose they are, and frames per second."""
+
+    joints: Tensor
+    person: str
+    rate: float
+
+
+def _frames(number: int, rate: float, usual: float) -> int:
+    """Return the frames at a rate that last as long as a number of frames at the usual one."""
+    return number if same_rate(rate, usual) else max(1, round(number * rate / usual))
+
+
 def _track(
+    prior: UpperBodyPrior, pieces: list[_Piece], modes: Mapping[str, dict[str, Any]], seed: int
+) -> dict[str, HeldOut]:
+    """Track pieces of recordings in several ways, each at its rate; return errors and covariances."""
+    rates = group_by_rate([piece.rate for piece in pieces], prior.info.fps)
+    parts = [
+        _track_at(prior, [pieces[i] for i in group], modes, seed, rate)
+        for rate, group in rates.items()
+    ]
+    return HeldOut.join_modes(parts)
+
+
+def _track_at(
     prior: UpperBodyPrior,
-    pieces: list[tuple[Tensor, str]],
+    pieces: list[_Piece],
     modes: Mapping[str, dict[str, Any]],
     seed: int,
+    fps: float,
 ) -> dict[str, HeldOut]:
-    """Track pieces of recordings in several ways, and return errors and covariances of each."""
-    keypoints, truth, inside = _seen(prior, [piece for piece, _ in pieces], seed)
+    keypoints, truth, inside = _seen(prior, [piece.joints for piece in pieces], seed)
     scored = inside & torch.isfinite(truth).flatten(2).all(2)
-    who = [pieces[i][1] for i in scored.nonzero()[:, 0].tolist()]
+    who = [pieces[i].person for i in scored.nonzero()[:, 0].tolist()]
     found = {}
     for mode, settings in modes.items() if who else ():
-        tracker = UpperBodyTracker(prior, prior.camera, calibrated=False, **settings)
+        tracker = UpperBodyTracker(prior, prior.camera, calibrated=False, fps=fps, **settings)
         generator = torch.Generator().manual_seed(seed)
         with torch.inference_mode():
             track = tracker(keypoints, lengths=inside.sum(1), generator=generator)
