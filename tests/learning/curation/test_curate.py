@@ -150,6 +150,30 @@ def test_notes_are_counted_and_folders_of_one_name_are_said(tmp_path):
     assert any("a#ann, b#ann count as 2 persons" in note for note in curate(named).report.notes)
 
 
+def test_many_notes_on_single_files_hide_no_other(tmp_path):
+    """Notes that differ in numbers alone are one, and those on all recordings come first."""
+    recordings = [
+        recording(joints=moving(150, seed=i), path=tmp_path / f"room{i % 2}" / "ann" / f"{i}.csv",
+                  fps=None if i else 30.0,
+                  notes=(f"taken for millimetres (the shoulders are apart {300 + i / 4:g})",
+                         f"{1 + i % 5} frames are not in the file: after {', '.join('789'[:1 + i % 3])}",
+                         f"columns not used: {'abcdefghijklmnopqrstuvwxyz'[i]}"))
+        for i in range(25)
+    ]  # fmt: skip
+    report = curate(recordings).report
+    assert report.notes[0].startswith("2 folders count as the one person ann#")
+    assert "no frame rate is stated by" in report.notes[1] and "and 22 more" in report.notes[1]
+    assert report.notes[2:4] == (
+        "taken for millimetres (the shoulders are apart 300) (25 recordings, numbers of the first)",
+        "1 frames are not in the file: after 7 (25 recordings, numbers of the first)",
+    )
+    assert len(report.notes) == 29 and report.text().endswith("note     and 9 more")
+
+
+def test_stated_frame_rates_need_no_note():
+    assert not any("frame rate" in note for note in curate(people()).report.notes)
+
+
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("folder", "step", "most"),

@@ -1,5 +1,6 @@
 """Curate recordings: apply all checks and changes in order, and report them."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -32,11 +33,13 @@ from torchpose.learning._curation.splits import (
     refuse_shared_between_persons,
     same_names,
     skeleton_counts,
+    unstated_rates,
 )
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
 _RATE = 30.0  # of recordings that do not say: a Kinect's
+_NUMBERS = re.compile(r"\d[\d.]*(?:(?:, |-)\d[\d.]*)*(?: and \d+ more places)?")
 _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")
 
 
@@ -271,13 +274,19 @@ def _size(recordings: Sequence[Recording]) -> Size:
 
 
 def _notes(recordings: Sequence[Recording], settings: CurationSettings) -> tuple[str, ...]:
-    counts = Counter(note for r in recordings for note in r.notes)
-    notes = [f"{note} ({n} recording{'s' * (n != 1)})" for note, n in counts.most_common()]
+    """Return notes on all recordings together, then those of single ones, alike ones once."""
+    notes = [*_same_folders(recordings), *same_names(recordings), *unstated_rates(recordings)]
     sets = skeleton_counts(recordings)
     if len(sets) > 1:
         mixed = ", ".join(f"{name} {n}" for name, n in sets.items())
         notes.append(f"joint sets are mixed: {mixed} recordings; necks are converted to one kind")
-    return (*notes, *_same_folders(recordings), *same_names(recordings))
+    alike: dict[str, list[str]] = {}
+    for note in (note for r in recordings for note in r.notes):
+        alike.setdefault(_NUMBERS.sub("#", note), []).append(note)
+    for same in sorted(alike.values(), key=len, reverse=True):
+        first = ", numbers of the first" if len(set(same)) > 1 else ""
+        notes.append(f"{same[0]} ({len(same)} recording{'s' * (len(same) != 1)}{first})")
+    return tuple(notes)
 
 
 def _same_folders(recordings: Sequence[Recording]) -> list[str]:

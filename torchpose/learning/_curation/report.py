@@ -77,7 +77,10 @@ class CurationReport(NamedTuple):
         lines += [f"         {drop.text()}" for drop in largest]
         if len(self.drops) > most:
             lines.append(f"         and {len(self.drops) - most} more")
-        return "\n".join([*lines, *(f"note     {note}" for note in self.notes[:_SHOWN_NOTES])])
+        lines += [f"note     {note}" for note in self.notes[:_SHOWN_NOTES]]
+        if len(self.notes) > _SHOWN_NOTES:
+            lines.append(f"note     and {len(self.notes) - _SHOWN_NOTES} more")
+        return "\n".join(lines)
 
     def totals(self) -> dict[str, tuple[int, str]]:
         """Count the omissions by reason, with their unit (joints or frames)."""

@@ -143,6 +143,19 @@ def same_names(recordings: Iterable[Recording]) -> list[str]:
     ]
 
 
+def unstated_rates(recordings: Iterable[Recording]) -> list[str]:
+    """Return a note on recordings that do not state their frame rate, if there are any."""
+    unknown = [label(recording) for recording in recordings if not recording.fps]
+    if not unknown:
+        return []
+    more = f" and {len(unknown) - 2} more" if len(unknown) > 2 else ""
+    return [
+        f"no frame rate is stated by {', '.join(unknown[:2])}{more}; that of most other recordings is "
+        "assumed, without any 30 frames per second: state it (key `fps` in the .npz, a column `time` or "
+        "`# fps = 30` above the header of a table)"
+    ]
+
+
 def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
     """Return the ids of the named persons; a name may leave out its origin.
 
