@@ -363,3 +363,46 @@ def test_infinite_joints_name_person_and_frame(tmp_path):
     text[4] = ",".join(cells)
     with pytest.raises(FileFormatError, match=r"a.csv, person eve.*frame 2 is \(Head\)"):
         read_recording(write(tmp_path, "a.csv", "\n".join(text)))
+
+
+def table(path, stamps, name="time", separator=",", decimal="."):
+    """Three joints of two frames, with a column of time stamps."""
+    cells = [
+        [
+            name,
+            *(
+                f"{joint}_{axis}"
+                for joint in ("Head", "ShoulderLeft", "ShoulderRight")
+                for axis in "xyz"
+            ),
+        ]
+    ]
+    body = ("0.0", "0.7", "2.1", "-0.17", "0.4", "2.1", "0.17", "0.4", "2.1")
+    cells += [[cell.replace(".", decimal) for cell in (str(stamp), *body)] for stamp in stamps]
+    path.write_text("# axes = kinect\n" + "\n".join(separator.join(row) for row in cells) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "second"),
+    [("timestamp", 10**9), ("Time (s)", 1), ("Time [ms]", 1000), ("time_us", 10**6)],
+)
+def test_time_columns_of_a_table(tmp_path, name, second):
+    path = table(tmp_path / "a.csv", [i * second / 20 for i in range(5)], name)
+    [found] = read_recordings(path)
+    assert found.fps == pytest.approx(20.0) and not any("not used" in n for n in found.notes)
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas(tmp_path, separator):
+    stamps = [i / 25 for i in range(5)]
+    [found] = read_recordings(table(tmp_path / "a.csv", stamps, separator=separator, decimal=","))
+    [plain] = read_recordings(table(tmp_path / "b.csv", stamps))
+    assert found.joints.equal(plain.joints) and found.fps == pytest.approx(25.0)
+
+
+def test_an_unknown_header_is_answered_by_the_known_one(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([",".join(f"c{i}" for i in range(61)), ",".join(["0.5"] * 61)]))
+    with pytest.raises(FileFormatError, match="line 1: expected numbers, or a header with NAME_x"):
+        read_recordings(path)

@@ -20,7 +20,10 @@ from torchpose.skeleton._joint_sets import SKELETONS, canonical_name
 
 KINECT_FPS = 30.0
 _KINECT_TICK = 1e-7  # Kinect v2's time stamps count 100 ns
-_TICKS = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", _KINECT_TICK: "100 ns"}
+_TICKS = {
+    1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", _KINECT_TICK: "100 ns",
+    1e-9: "nanoseconds",
+}  # fmt: skip
 _GAP = 1.5  # median steps
 _RATES = (4.0, 250.0)  # frames per second that a recording may have
 _COLUMN = re.compile(
@@ -70,11 +73,16 @@ def read_kinect_csv(path: Path) -> list[RawRecording]:
 
 
 def split_row(line: str) -> list[str]:
-    """Return the cells of a row, at commas, semicolons or tabs, else at blanks."""
+    """Return the cells of a row, at semicolons, tabs or commas, else at blanks.
+
+    Between semicolons or tabs a comma is the decimal mark.
+    """
     line = line.strip()
-    for mark in (",", ";", "\t"):
+    for mark in (";", "\t", ","):
         if mark in line:
-            return [cell.strip() for cell in line.removesuffix(mark).split(mark)]
+            line = line.removesuffix(mark)
+            line = line if mark == "," else re.sub(r"(?<=\d),(?=\d)", ".", line)
+            return [cell.strip() for cell in line.split(mark)]
     return line.split()
 
 
@@ -93,8 +101,8 @@ def header_joints(line: str) -> dict[str, dict[str, int]]:
 def frame_rate(stamps: np.ndarray) -> tuple[float | None, str]:
     """Return the frames per second by the median step of the stamps, and what they were taken for.
 
-    Of seconds, milliseconds, microseconds and 100 ns, the one that comes nearest to 30 frames per
-    second; None for steps that are none of them, such as numbers of frames.
+    Of seconds, milliseconds, microseconds, 100 ns and nanoseconds, the one that comes nearest to 30
+    frames per second; None for steps that are none of them, such as numbers of frames.
     """
     steps = np.diff(stamps)
     steps = steps[steps > 0]
@@ -177,7 +185,10 @@ def _table(path: Path, rows: list[tuple[int, str]], layout: _Layout) -> np.ndarr
         try:
             row = [float(value) if value else math.nan for value in split_row(line)]
         except ValueError as error:
-            raise FileFormatError(f"{path}, line {number}: expected numbers ({error})") from error
+            raise FileFormatError(
+                f"{path}, line {number}: expected numbers, or a header with NAME_x, NAME_y and NAME_z of "
+                f"each joint above them ({error})"
+            ) from error
         if len(row) != width:
             raise FileFormatError(
                 f"{path}, line {number}: expected {width} numbers "
@@ -213,7 +224,8 @@ def _read_with_header(
     path: Path, rows: list[tuple[int, str]], facts: dict[str, str]
 ) -> list[RawRecording]:
     columns = header_joints(rows[0][1])
-    header = [cell.strip().strip('"').lower() for cell in split_row(rows[0][1])]
+    # "Time (s)" is time_s
+    header = [re.sub(r"\W+", "_", cell).strip("_").lower() for cell in split_row(rows[0][1])]
     for joint, places in columns.items():
         if not {"x", "y", "z"} <= set(places):
             raise FileFormatError(
