@@ -175,7 +175,8 @@ class _Command(LightningCLI):
         self.datamodule.setup("fit")
         report = getattr(self.datamodule, "report", None)
         if report is not None:
-            rank_zero_only(print)(report.text(_SHOWN_DROPS), flush=True)
+            unread = (f"note     {note}" for note in self.datamodule.unread)
+            rank_zero_only(print)(report.text(_SHOWN_DROPS), *unread, sep="\n", flush=True)
 
     def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
         given = super()._prepare_subcommand_kwargs(subcommand)

@@ -9,7 +9,7 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
 from torchpose.errors import InputError, OverlapError
 from torchpose.io import Recording, read_recordings
-from torchpose.io._recordings import find_recordings
+from torchpose.io._recordings import find_recordings, notes_on_unread_files
 from torchpose.learning._curation import (
     CurationReport,
     CurationSettings,
@@ -62,6 +62,7 @@ class RecordingsDataModule(LightningDataModule):
         super().__init__()
         self.recipe = recipe
         self.report: CurationReport | None = None
+        self.unread: list[str] = []
         self.train: list[Recording] = []
         self.watched: list[Recording] = []
         self.tasks: dict[str, MixtureTask] = {}
@@ -77,6 +78,7 @@ class RecordingsDataModule(LightningDataModule):
         self.train, self.watched, self.report = read_sides(
             self._paths, self._axes, self._persons, self._held_out, self._curation
         )
+        self.unread = notes_on_unread_files([expand_path(path) for path in self._paths])
         self.tasks = self.recipe.tasks(self.train)
         self.sources = {Key(name): cached(task.source) for name, task in self.tasks.items()}
         if self.watched:

@@ -138,6 +138,16 @@ def test_what_jumps_is_left_out_and_said(torchpose, files, tmp_path):
     assert plain.code == 0 and "jump:" not in plain.out
 
 
+def test_files_that_are_not_read_are_said(torchpose, files, tmp_path):
+    """A folder with one recording as .npz and another one as a table is not read in full."""
+    folder = tmp_path / "recordings"
+    shutil.copytree(files / "recordings", folder)
+    (folder / "b.csv").write_text("frame,HeadPosX,HeadPosY,HeadPosZ\n0,0,0.7,2\n")
+    done = torchpose("fit", folder, "--out", tmp_path / "p.safetensors", *QUICK)
+    assert done.code == 0, done.err
+    assert "holds recordings as .npz" in done.out and str(folder / "b.csv") in done.out
+
+
 def test_many_paths_are_cut_short():
     given = command().given([f"r{i}.npz" for i in range(20)] + ["--out", "p.safetensors"])
     assert given.line("p.safetensors") == "torchpose fit r0.npz '...19 more' --out p.safetensors"

@@ -155,7 +155,7 @@ def test_only_persons_whom_files_name_are_scored(tmp_path, monkeypatch):
 def test_mirrored_recordings_are_said(tmp_path):
     for name, factor in (("a", 1.0), ("b", -1.0)):
         joints = poses(8, 0).numpy() * [factor, 1, 1]
-        np.savez(tmp_path / f"{name}.npz", joints=joints, names=UPPER_BODY, subject=name)
+        np.savez(tmp_path / f"{name}.npz", joints=joints, names=UPPER_BODY, subject=name, fps=30.0)
     [note] = persons_module.read_known_persons(tmp_path).notes
     assert note.startswith("In 1 of 2 recordings:") and "mirrored" in note
 

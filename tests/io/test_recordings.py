@@ -9,7 +9,7 @@ import torch
 from tests.data import data_dir_or_skip
 from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.io import read_recording, read_recordings
-from torchpose.io._recordings import find_recordings
+from torchpose.io._recordings import find_recordings, notes_on_unread_files
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 V2 = SKELETONS["kinect-v2-25"].joints
@@ -285,6 +285,13 @@ def test_find_recordings(tmp_path):
     assert [p.name for p in found] == ["a.npz", "b.npz", "Ges.csv"]
     assert find_recordings([tmp_path / "set", tmp_path, found[1]]) == found
     assert [len(r) for r in read_recordings([tmp_path])] == [4, 4, 5]
+    beside, other = notes_on_unread_files(tmp_path)
+    assert (
+        "holds recordings as .npz" in beside and beside.count(".csv") == 1 and "raw.csv" in beside
+    )
+    assert "do not begin as a recording does" in other and "keypoints.csv" in other
+    assert notes_on_unread_files([tmp_path, tmp_path / "set" / "raw.csv"]) == [other]
+    assert notes_on_unread_files(found) == []
 
 
 def test_nothing_found(tmp_path):

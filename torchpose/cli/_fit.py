@@ -105,17 +105,22 @@ def run(
         pictures: draw the mean poses.
         given: the command.
     """
-    from torchpose.io._recordings import find_recordings, read_recordings
+    from torchpose.io._recordings import (
+        find_recordings,
+        notes_on_unread_files,
+        read_recordings,
+    )
     from torchpose.learning._fit_files import check_fit_file, fit_results, write_prior_files
 
     _check_options(given)
     file = check_fit_file(out)
     everything = read_recordings(find_recordings(recordings), axes)
+    unread = notes_on_unread_files(recordings)
     pictures = pictures_possible(pictures)
     kept, said, facts = _curated(_without(everything, without or []), curation if curate else None)
     words = {"name": name or file.stem, "licence": licence, "command": given.line(out)}
     with fit_results(file, given.files(), pictures) as results:
-        print(said, flush=True)
+        print(said, *(f"note     {n}" for n in unread), sep="\n", flush=True)
         if noise == "none":
             prior = _fit_mixtures(kept, recipe, samples, words)
         elif noise_of is not None:

@@ -10,7 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.io._recordings import BACK_TO_CAMERA, Recording, read_recordings
+from torchpose.io._recordings import (
+    BACK_TO_CAMERA,
+    Recording,
+    notes_on_unread_files,
+    read_recordings,
+)
 from torchpose.learning._curation.joints import measured, runs
 from torchpose.learning._curation.splits import same_names, unstated_rates
 
@@ -70,7 +75,8 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
         f"Other people in {', '.join(files)} are left out ({len(others)} recordings): nobody says who "
         "they are."
     ] * bool(others)
-    notes += [f"{note}." for note in (*same_names(known), *unstated_rates(known))]
+    doubts = [*same_names(known), *unstated_rates(known), *notes_on_unread_files(paths)]
+    notes += [f"{note}." for note in doubts]
     turned = [r for r in known if BACK_TO_CAMERA in r.notes]
     notes += [f"In {len(turned)} of {len(known)} recordings: {BACK_TO_CAMERA}."] * bool(turned)
     return KnownPersons(known, notes)

@@ -232,6 +232,39 @@ def find_recordings(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
+def notes_on_unread_files(paths: str | Path | Iterable[str | Path]) -> list[str]:
+    """Return notes on files in folders that `find_recordings` passes over though they may be recordings.
+
+    Args:
+        paths: one path or several, as for `find_recordings`; files are read anyway.
+    """
+    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(p) for p in paths]
+    read = set(find_recordings(given))
+    files = [f for p in given if p.is_dir() for f in sorted(p.rglob("*")) if f.is_file()]
+    unread = [f for f in dict.fromkeys(files) if f not in read and not f.name.startswith(".")]
+    unread = [f for f in unread if f.suffix.lower() in _SUFFIXES[1:]]
+    archives = {f.parent for f in read if f.suffix.lower() == ".npz"}
+    beside = [f for f in unread if f.parent in archives]
+    other = [f for f in unread if f.parent not in archives]
+    notes = []
+    if beside:
+        notes.append(
+            f"not read, since the folder holds recordings as .npz: {_some(beside)}; if they are others, "
+            "move them to another folder"
+        )
+    if other:
+        notes.append(
+            f"not read, since they do not begin as a recording does: {_some(other)}; named alone, such a "
+            "file tells what is wrong"
+        )
+    return notes
+
+
+def _some(files: list[Path]) -> str:
+    more = f" and {len(files) - 2} more" if len(files) > 2 else ""
+    return f"{', '.join(map(str, files[:2]))}{more}"
+
+
 # --- what is a recording --------------------------------------------------------------------------
 
 
