@@ -150,7 +150,8 @@ class UpperBodyPrior(nn.Module):
         if seen:
             raise OverlapError(
                 f"the prior {self.info.name!r} was fitted on {', '.join(seen)}; score it on other "
-                "persons, or fit the same recipe without these"
+                "persons, or fit the same recipe without these; if they are others of the same name, rename "
+                "their folders, or `subject` in their files"
             )
 
     def get_extra_state(self) -> Tensor:
