@@ -350,7 +350,7 @@ def test_keypoints_of_no_body_have_no_poses(track, capsys):
     assert track_output.report_failure(poses) == 0
     nothing = replace(poses, observed=torch.zeros_like(poses.observed))
     assert track_output.report_failure(nothing) == 1
-    assert "no keypoint was taken for a measurement" in capsys.readouterr().err
+    assert "every keypoint was rejected as an outlier" in capsys.readouterr().err
 
 
 # --- refusals -------------------------------------------------------------------------------------

@@ -124,9 +124,9 @@ def test_a_reader_that_is_too_slow_is_told(camera, closed):
             source.close()
             break
     assert source.notes[0].startswith(
-        "camera 3 was read at 7.5 frames per second and taken for one of 30"
+        "camera 3 was read at 7.5 frames per second, and 30 were assumed"
     )
-    assert "4 times as fast as in truth" in source.notes[0] and "--fps 7.1" in source.notes[0]
+    assert "4 times as fast as the person" in source.notes[0] and "--fps 7.1" in source.notes[0]
     assert len(source.notes) == 2 - closed
     source, _ = camera(WARM_UP + 90)
     assert len(list(source)) == 90 and len(source.notes) == 1

@@ -484,7 +484,7 @@ def test_the_rate_must_be_positive(tmp_path):
 def test_pixels_that_are_not_square(tmp_path):
     path = make_video(tmp_path / "a.mp4", 3, tags={"sample_aspect_ratio": Fraction(16, 11)})
     _, source = read(path)
-    assert source.notes == ["pixels are not square (16/11); taken as if they were"]
+    assert source.notes == ["pixels are not square (16/11); treated as square"]
 
 
 def test_interlaced(tmp_path):

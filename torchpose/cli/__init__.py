@@ -23,7 +23,7 @@ COMMANDS = {
     "fit": "fit a prior to recorded 3D poses",
     "evaluate": "score priors on recordings: score, leave-one-person-out, ...",
     "demo": "track an animated performer; needs no data",
-    "info": "version, priors that are there, what a file holds",
+    "info": "version, shipped models, contents of a file",
 }
 _EXAMPLES = """\
 examples:

@@ -122,53 +122,53 @@ def run(
     pictures: bool = True,
     given: Given,
 ) -> int:
-    """Track whole bodies in calibrated cameras: of persons by 2D keypoints, of one in videos by silhouettes.
+    """Track whole bodies in calibrated cameras that stand still.
 
-    The cameras stand still. Keypoints are those of files, or with --detector those that a model finds in
-    videos; one camera is enough for them. Writes body.npz, joints.csv, an overlay of every camera,
-    report.html and pictures into a folder.
+    With keypoints, of files or found in videos by --detector, one camera is enough, and several persons can
+    be tracked. Videos without --detector are tracked by the silhouettes of one person. Writes body.npz,
+    joints.csv, an overlay of every camera, report.html and pictures into a folder.
 
     Args:
         cameras: TOML file with a table per camera: size, matrix, distortions, and its pose.
-        inputs: an input per camera, in the order of the file, in step: keypoints (.npz, .csv or a folder of
-            OpenPose JSON files), or a video or a folder of images.
+        inputs: an input per camera, in the order of the file, synchronised: keypoints (.npz, .csv or a folder
+            of OpenPose JSON files), or a video or a folder of images.
         out: folder of the results.
         camera_names: which cameras of the file the inputs are of, if not all in order.
         detector: find keypoints in the videos: a model in ONNX (.onnx), a pose landmarker of MediaPipe
             (.task), or package:factory, a Python callable that returns a detector.
         min_confidence: with --detector: treat keypoints as missing below this confidence (default 0.3).
-        smoothing: kalman: "full" lets later frames count too.
+        smoothing: kalman: "full" uses later frames too.
         refine: kalman: estimate the cameras' delays against the first, their poses (extrinsics), or both
             from the person who moves, and write refined_cameras.toml.
         persons: kalman: track several persons, all or at most N at a time; without it one is followed.
         videos: keypoints: a video per camera, into which the body is drawn; by default the inputs, if they
             are videos.
-        silhouettes: keypoints and --method: let silhouettes of these videos count beside the keypoints.
+        silhouettes: keypoints and --method: use the silhouettes of the videos in addition to the keypoints.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
             what stays in a video is its background, so the person has to move about.
-        ignore_still: with --background: take what always looks the same in a video for an object that was
-            moved since the scene was empty, and not for the person; not if the person stands still.
-        method: of keypoints kalman, by default. The others are particle filters on silhouettes or keypoints:
-            mrpf, regularised by a manifold (needs --manifold); apf, annealed; sir, plain; root, hypotheses of
-            the root with Gaussian limbs (needs --conditionals); or constrained, to an action (needs
-            --action). Of silhouettes the default is the one that suits the file given, else apf.
+        ignore_still: with --background: leave out what never changes in a video, such as an object that was
+            moved since the scene was empty. Do not use it if the person stands still.
+        method: kalman, the default for keypoints, or a particle filter for silhouettes or keypoints: mrpf,
+            regularised by a manifold (needs --manifold); apf, annealed; sir, plain; root, hypotheses of the
+            root with Gaussian limbs (needs --conditionals); or constrained, to an action (needs --action).
+            For silhouettes the default is the one that uses the given model, without a model apf.
         tracker: the arguments of `BodyTracker`.
         initial_pose: a body.npz whose first pose the person begins with; without it, that pose is found.
-        facing: the direction in which the person looks at first, in world axes; without it, the first
-            steps and the bend of the knees tell, which is wrong for a person who walks backwards or
-            stands straight.
+        facing: the direction in which the person looks at first, in world axes; without it, the direction
+            of the first steps and the bend of the knees decide. Give it if the person walks backwards or
+            stands straight at first.
         rows: the height of the silhouettes, pixels.
-        sharpness: the exponent of the likelihood of silhouettes; not for root, nor for apf without keypoints,
-            which solve for theirs (default 100, for the overlap that constrained uses 30; the papers have 1).
+        sharpness: the exponent of the likelihood of silhouettes (default 100, for constrained 30; the papers
+            have 1). It is not for root, nor for apf without keypoints, which compute theirs.
         method_options: the options of the filter.
-        fps: the frame rate at which all videos are read, and which keypoints have.
-        delays: the number of frames by which each input began too early (default none).
+        fps: the frame rate of the keypoints, and at which all videos are read.
+        delays: the number of frames to skip at the beginning of each input (default none).
         seed: the seed of the filter; kalman has none.
         formats: also write the poses as body.trc, body.c3d or body.bvh.
         up: the axis of the cameras' world that points up: kalman expects people upright along it, and the
             files of --formats have y up. By default they have the axes of the world.
         overlay: write a video per camera with the body drawn into it.
-        pictures: write overlay.png, and of keypoints skeleton.png.
+        pictures: write overlay.png, and for keypoints skeleton.png.
         given: the command.
 
     Returns:

@@ -136,19 +136,19 @@ def _sample_size(track: "PoseTrack") -> list[str]:
     size = size[size.isfinite().all(-1)]
     if not len(size):
         return []
-    limbs = "directions of its limbs"
+    limbs = "limb directions"
     kinds = {"pf": "particles", "window": "components", "articulated": limbs, "multiple": limbs}
     kind = kinds.get(track.method.partition("-")[0], "tracks")
     left, right = size.quantile(0.5, 0).tolist()
-    return [f"weight   on {left:.3g} (left arm) and {right:.3g} (right arm) {kind}, median"]
+    return [f"samples  {left:.3g} (left arm) and {right:.3g} (right arm) effective {kind}, median"]
 
 
 def report_failure(track: "PoseTrack") -> int:
     """Return the exit code: 1, with a line on stderr, if the poses are of no use, else 0."""
     if not bool(track.observed.any()):
         print(
-            "torchpose: no keypoint was taken for a measurement, so the poses are the prior's: all of them "
-            "belong to no body. Check the camera, the units and the names of the keypoints",
+            "torchpose: every keypoint was rejected as an outlier, so no pose rests on a measurement. "
+            "Check the camera, the units and the names of the keypoints",
             file=sys.stderr,
         )
         return 1
@@ -156,8 +156,8 @@ def report_failure(track: "PoseTrack") -> int:
     if at < 0:
         return 0
     print(
-        f"torchpose: the filter degenerated at frame {at}; poses from there on are NaN. Measurements "
-        "far from what the prior knows do that: check the camera and left and right, or raise "
+        f"torchpose: the filter degenerated at frame {at}; poses from there on are NaN. The cause "
+        "is measurements far from all poses of the prior: check the camera and left and right, or raise "
         "--measurement-std",
         file=sys.stderr,
     )

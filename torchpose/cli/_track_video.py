@@ -328,7 +328,7 @@ def _measured_by(options: dict[str, Any]) -> str:
     """Return a phrase about the measurer, for the report."""
     if options["detector"] is not None:
         return f"keypoints by {options['detector']}"
-    return f"hands by {options['hands']}"
+    return f"hands: {options['hands']}"
 
 
 def _nobody(

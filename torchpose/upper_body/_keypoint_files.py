@@ -31,21 +31,21 @@ class TrackSettings:
 
     Args:
         prior: the name of a prior that comes with torchpose, or a .safetensors file.
-        method: the name of an estimator; by default articulated if wrists are measured and the prior has
-            hands, else multiple-model if the prior has windows that suit, else articulated or mkf-fixed; in a
-            video, articulated if its prior over arms was fitted to all persons of the prior.
+        method: the name of an estimator; by default the input decides: articulated for videos and for
+            wrists, multiple-model for hands in files. Other priors than the shipped ones may lead to
+            another default (docs/which-tracker.md).
         camera: the camera: a TOML file, or four numbers fx,fy,cx,cy in pixels; by default K or the image
             size of the input.
         camera_name: the name of the camera in a file that has several.
         tilt: the angle in degrees by which the camera looks up, as most webcams of laptops do; negative if it
             looks down (default: about level).
         roll: the angle in degrees by which the camera is rolled clockwise, as seen from behind it.
-        up: the axis of the world that points up, y or z, by which the rotation in the file of the camera
-            tells tilt and roll.
+        up: the axis of the world that points up, y or z; tilt and roll then follow from the rotation in the
+            file of the camera.
         measurement_std: the standard deviation of a keypoint in pixels: one number, or five with commas
             for hand, elbow, shoulder, head, neck; by default as the prior learnt it, else 3.
-        smoothing: use this many later frames, or all of them ("full"), for each estimate, or none of them
-            ("none"); with all but mkf-sampled, mkf-split and the pf methods.
+        smoothing: use this many later frames for each estimate, all of them ("full") or none of them
+            ("none"); mkf-sampled, mkf-split and the pf methods have no smoothing.
         n_particles: the number of particles of the pf methods (default 10000).
         n_tracks: the number of tracks of mkf-sampled and mkf-split.
         arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
@@ -67,8 +67,8 @@ class TrackSettings:
             resampled to it.
         max_gap: the longest time without any keypoint in seconds, null for no bound (default 5); in a
             video, a person who is away for longer has no pose until they return.
-        outliers: treat keypoints that belong to no body as missing, and exchange hands back that are
-            exchanged.
+        outliers: treat keypoints as missing where no joint of this body can be, and correct hands whose
+            left and right are exchanged.
         seed: the seed of methods that draw; every recording starts from it.
     """
 

@@ -158,8 +158,8 @@ class CameraSource(VideoSource):
         if abs(rate / self.fps - 1) > _WRONG:
             reached = f"{(1 - _WRONG) * rate:.3g}"
             self.notes.append(
-                f"{self.name} was read at {rate:.3g} frames per second and taken for one of {self.fps:.4g}: "
-                f"what was made of it moves {self.fps / rate:.2g} times as fast as in truth; ask for a rate "
+                f"{self.name} was read at {rate:.3g} frames per second, and {self.fps:.4g} were assumed: "
+                f"poses and overlay move {self.fps / rate:.2g} times as fast as the person; ask for a rate "
                 f"that is reached (fps={reached}, --fps {reached})"
             )
 

@@ -135,14 +135,14 @@ class FileSource(VideoSource):
         if odd_turn:
             self.notes.append("to be shown at an angle that is no multiple of 90 degrees: ignored")
         if frame.interlaced_frame:
-            self.notes.append("interlaced: fast movements are combed; deinterlace the file first")
+            self.notes.append("interlaced: fast movements have striped edges; deinterlace the file first")
         if frame.color_trc in _HDR:
             self.notes.append(
                 f"high dynamic range ({_HDR[frame.color_trc]}) is not tone-mapped: colours look flat"
             )
         aspect = self._stream.sample_aspect_ratio
         if aspect and aspect != 1:
-            self.notes.append(f"pixels are not square ({aspect}); taken as if they were")
+            self.notes.append(f"pixels are not square ({aspect}); treated as square")
         videos = [s for s in self._container.streams.video if not is_cover(s)]
         if len(videos) > 1:
             self.notes.append(f"{len(videos)} video streams; the first is read")

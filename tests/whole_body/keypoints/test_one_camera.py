@@ -229,7 +229,7 @@ def test_live_steps_find_the_size_of_whole_sequences():
 def test_heights_of_cameras_that_tell_nothing_are_refused():
     with pytest.raises(InputError, match="2 cameras, which tell it themselves"):
         torchpose.BodyTracker(ring(2), "kalman", up="y", camera_height=1.5)
-    with pytest.raises(InputError, match="which way is down is not known; give up"):
+    with pytest.raises(InputError, match="the vertical, which is not known; give up"):
         torchpose.BodyTracker(ring(1), "kalman", camera_height=1.5)
     for height in (0.0, -1.0, 110.0, math.nan, "high"):
         with pytest.raises(InputError, match="between 0 and 30 m"):

@@ -35,10 +35,10 @@ def check_units(filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
     factor = math.exp(float(logs.median()))
     if not _SHORTEST < factor < _LONGEST:
         raise CameraError(
-            "cameras must be given in metres, and as they are given the bones of the person are about "
-            f"{factor:.2g} times as long as anybody's; divide translations in millimetres by 1000, those in "
+            "cameras must be given in metres, but with these cameras the bones of the person come out about "
+            f"{factor:.2g} times too long; divide translations in millimetres by 1000, those in "
             "centimetres by 100, and those in an unknown unit by about that factor. If they are in metres, "
-            "look whether poses are those from camera to world; those from world to camera are needed"
+            "check the direction of rotation and translation: they must lead from world to camera axes"
         )
 
 

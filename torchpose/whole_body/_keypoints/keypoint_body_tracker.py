@@ -376,7 +376,7 @@ def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -
         )
     if up is None:
         raise InputError(
-            "camera_height tells how far below the camera the floor is, and which way is down is not known; "
+            "camera_height is measured along the vertical, which is not known; "
             'give up as well, "y" or "z", the axis of the cameras\' world that points up'
         )
 

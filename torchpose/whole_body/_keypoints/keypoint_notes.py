@@ -66,8 +66,8 @@ def notes_of(
         if astray > _DISAGREES:
             notes.append(
                 f"{100 * astray:.0f} % of the keypoints of camera {name} do not agree with the body; check "
-                "its calibration, whether that is of images of the keypoints' size, its delay against the "
-                "others, and whether its video is mirrored or its keypoints are another person's"
+                "its calibration (also for which image size it is), its delay against the others, whether "
+                "its video is mirrored, and whether its keypoints are those of another person"
             )
         swapped = float((exchanged[:, c] > 0.5).all(-1)[there[:, c].any(-1)].double().mean())
         if swapped > _MIRRORED:
@@ -77,8 +77,8 @@ def notes_of(
             )
     if len(cameras) == 1 and not sized:
         notes.append(
-            "one camera does not tell how large a person is: size and distance are those of the persons "
-            "of the prior; give height, body, or camera_height with up, if they are known"
+            "one camera cannot measure the size of a person: size and distance are those of an average "
+            "person; give height, body, or camera_height with up, if one of them is known"
         )
     notes += _notes_on_joints_without_keypoints(there)
     guessed = int((alone >= 0).sum())
@@ -86,7 +86,7 @@ def notes_of(
         seen_by = ", ".join(cameras[c] for c in alone[alone >= 0].unique().tolist())
         notes.append(
             f"one camera alone ({seen_by}) saw the person in {guessed} frames: size and distance there "
-            "are those of the persons of the prior; give height or body if they are known"
+            "are those of an average person; give height or body if one of them is known"
         )
     notes += [
         f"nothing was measured in frames {first_frame + first} to {first_frame + last}; the poses "
@@ -117,8 +117,8 @@ def notes_on_size(height: float, n_cameras: int, sized: bool) -> tuple[str, ...]
     if sized or n_cameras == 1 or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
         return ()
     return (
-        f"the bones are those of a person of {height:.2f} m; if nobody of that size is there, the cameras "
-        "are not in metres, or the keypoints are of images of another size than the calibrated ones",
+        f"the estimated bones are those of a person of {height:.2f} m; if that is wrong, the cameras are not "
+        "in metres, or the keypoints are of images of another size than the calibrated ones",
     )
 
 
@@ -195,9 +195,9 @@ def notes_on_strays(
     """
     share = 100 * strays.sum(0) / there.sum(0).clamp_min(1)
     return tuple(
-        f"in {float(share[c]):.0f} % of its frames camera {cameras[c]} sees somebody where nobody is, and "
-        "misses somebody who is there: its calibration may be wrong, its input that of another camera, or "
-        "its video late or mirrored"
+        f"in {float(share[c]):.0f} % of its frames camera {cameras[c]} has a detection that fits no tracked "
+        "person, and none of a person who is tracked: its calibration may be wrong, its input may be that "
+        "of another camera, or its video may be late or mirrored"
         for c in ((share > _STRAYS) & (strays.sum(0) >= _GAP)).nonzero().flatten().tolist()
     )
 
@@ -234,8 +234,8 @@ def notes_on_cameras_now(
 def _turned_back(said: Sequence[str], verb: str) -> str:
     """Return a note on cameras whose keypoints were, or are, turned back."""
     return (
-        f"against the calibration {' and '.join(said)} seem{'s' * (len(said) == 1)} to be turned; keypoints "
-        f"{verb} turned back, but where the person stands in the room may be wrong; "
+        f"{' and '.join(said)} seem{'s' * (len(said) == 1)} to be turned against the calibration; keypoints "
+        f"{verb} turned back, but the position of the person in the room may be wrong; "
         'refine="extrinsics" (--refine extrinsics) gives corrected cameras'
     )
 
@@ -298,8 +298,8 @@ def notes_on_up(up: str | None, joints: Float[Tensor, "T J 3"]) -> tuple[str, ..
     if angle < _LYING:
         return ()
     return (
-        f"the trunk is {angle:.0f} degrees away from {up}, which was given as up, in half of the frames or "
-        "more; if the person does not lie, another axis points up, and files of --formats are turned as well",
+        f"in half of the frames or more the trunk is {angle:.0f} degrees away from {up}, which was given as up; "
+        "if the person is not lying down, another axis points up, and the files of --formats are turned too",
     )
 
 
