@@ -89,7 +89,7 @@ def test_odd_sizes_are_padded_and_it_is_said(tmp_path, size, stored):
     with VideoWriter(tmp_path / "a.mp4", 25, size, crf=1) as writer:
         writer.write(image)
     assert writer.notes == [
-        f"H.264 wants even sizes: {size[0]}x{size[1]} is padded to {stored[0]}x{stored[1]}"
+        f"H.264 needs even sizes: {size[0]}x{size[1]} is padded to {stored[0]}x{stored[1]}"
     ]
     with open_video(tmp_path / "a.mp4") as source:
         assert source.size == stored

@@ -28,6 +28,7 @@ COMMANDS = {
 _EXAMPLES = """\
 examples:
   torchpose demo --out demo-output
+  torchpose track clip.mp4 --out result
   torchpose track keypoints.npz --out result
   torchpose track keypoints.csv --out result --camera 525,525,319.5,239.5 --smoothing full
   torchpose fit recordings/ --out prior.safetensors --components 30 --seed 0
@@ -119,7 +120,7 @@ def _help() -> str:
     commands = "\n".join(f"  {name:<11} {text}" for name, text in COMMANDS.items())
     return (
         "usage: torchpose COMMAND ...\n\n"
-        "Bayesian human-pose tracking: from video or 2D keypoints, gaps and all, to 3D poses.\n\n"
+        "Bayesian human-pose tracking: from video or 2D keypoints to 3D poses with covariances.\n\n"
         f"commands:\n{commands}\n\n"
         "options:\n"
         "  -h, --help  this text; `torchpose COMMAND --help` for the options of a command\n"

@@ -197,8 +197,8 @@ class Recordings:
         empty = [read_empty_scene(path) for path in self.background]
         if not empty:
             self.notes.append(
-                "without --background what stays in the videos is taken for their background; a part "
-                "of the person that never moves is taken for it, too"
+                "without --background everything that never changes in a video counts as background, also a "
+                "part of the person that never moves"
             )
         measurers = []
         for i, (view, path) in enumerate(zip(self.views, self.videos, strict=True)):

@@ -145,7 +145,7 @@ def run(
             are videos.
         silhouettes: keypoints and --method: use the silhouettes of the videos in addition to the keypoints.
         background: a picture, folder of pictures or video of the empty scene per camera; without it,
-            what stays in a video is its background, so the person has to move about.
+            what never changes in a video is its background, so the person has to move about.
         ignore_still: with --background: leave out what never changes in a video, such as an object that was
             moved since the scene was empty. Do not use it if the person stands still.
         method: kalman, the default for keypoints, or a particle filter for silhouettes or keypoints: mrpf,
@@ -265,7 +265,7 @@ def _facts(
     facts = {
         "videos": f"{len(recordings.videos)} cameras, {recordings.fps:g} fps",
         "silhouettes": f"{width} x {height} pixels, "
-        + ("against the empty scene" if recordings.background else "against what stays"),
+        + ("against the empty scene" if recordings.background else "against what never changes"),
         "method": f"{tracker.method}, {tracker.n_particles} particles{sharpness}",
         "learnt": ", ".join(filter(None, map(values.get, ("manifold", "conditionals", "action")))),
         "body": values["body"] or f"average proportions, {tracker.upright.height:.3g} m",

@@ -197,9 +197,9 @@ def summary(
     coasting = sum(int(poses.coasting.sum()) for poses in people)
     respread = sum(int(poses.respread.sum()) for poses in people)
     if coasting:
-        print(f"{'unseen':<12} {coasting} frames, in which the pose is a prediction")
+        print(f"{'unseen':<12} {coasting} frames, whose poses are predictions")
     if respread:
-        print(f"{'lost':<12} {respread} frames, in which the search began anew")
+        print(f"{'lost':<12} {respread} frames in which the search began anew")
     for note in (*_notes_of(people), *notes):
         print(f"{'note':<12} {note}")
     print(f"{'written':<12} " + ", ".join(map(str, written)))

@@ -299,8 +299,8 @@ def check_survival_rate(rate: float, n_particles: int) -> None:
         way = f"ask for {least:.3g} or more" if least < 1 else "take more particles"
         raise InputError(
             f"survival_rate of {rate:.3g} leaves {rate * n_particles:.2g} of {n_particles} particles, "
-            f"fewer than {LEAST_SURVIVORS:g}; {way}. A rate per second "
-            "leaves the fewer in a frame, the fewer frames a second has"
+            f"fewer than {LEAST_SURVIVORS:g}; {way}. With a rate per "
+            "second, fewer particles survive a frame if the frame rate is lower"
         )
 
 

@@ -175,7 +175,7 @@ class ResultsFolder:
         shutil.rmtree(trash, ignore_errors=True)
         if strangers:
             self.notes.append(
-                f"what was in the place of results and is not known to be of this command was moved to "
+                f"files in the place of results that were not written by this command were moved to "
                 f"{aside}: {_some(strangers)}"
             )
 

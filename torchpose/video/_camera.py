@@ -130,7 +130,7 @@ class CameraSource(VideoSource):
         finally:  # also if it is closed
             self._note_rate(times)
         self.notes.append(
-            f"{self.name} gave no more frames after {count}: unplugged, or taken by another program"
+            f"{self.name} gave no more frames after {count}: unplugged, or used by another program"
         )
 
     def _images(self) -> Iterator[tuple[Any, float]]:

@@ -287,7 +287,7 @@ class FileSource(VideoSource):
                 f"{count(self._resized, 'frame')} of another size, scaled to {width}x{height}"
             )
         if tally.restarts:
-            self.notes.append(f"the clock jumped {count(tally.restarts, 'time')}; taken as cuts")
+            self.notes.append(f"the clock jumped {count(tally.restarts, 'time')}; treated as cuts")
         if tally.late:
             self.notes.append(f"{count(tally.late, 'frame')} with a time not after the one before")
         repeated, dropped = count(tally.repeated, "frame"), count(tally.dropped, "frame")

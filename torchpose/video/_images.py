@@ -106,7 +106,7 @@ class FolderSource(VideoSource):
         steps = set(np.diff(last).tolist()) if len(last) == len(self._paths) else set()
         if len(steps) > 1:
             self.notes.append(
-                "the numbers in the names have gaps; images follow at once all the same"
+                "the numbers in the names have gaps; the images are used one after the other"
             )
 
     def _check_headers(self) -> None:

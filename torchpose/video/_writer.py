@@ -75,7 +75,7 @@ class VideoWriter:
         if any(self._padding):
             stored = f"{self.size[0] + self._padding[1]}x{self.size[1] + self._padding[0]}"
             self.notes.append(
-                f"H.264 wants even sizes: {self.size[0]}x{self.size[1]} is padded to {stored}"
+                f"H.264 needs even sizes: {self.size[0]}x{self.size[1]} is padded to {stored}"
             )
         encoder = _encoder()
         self._rate = Fraction(fps).limit_denominator(1001)

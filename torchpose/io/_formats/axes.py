@@ -36,7 +36,7 @@ def default_axes(where: str, names: Sequence[str]) -> str:
     skeleton = identify_skeleton(names)
     if skeleton is None:
         raise FileFormatError(
-            f"{where}: these {len(names)} joints are no known set, so the axes cannot be told; "
+            f"{where}: these {len(names)} joints are no known set, so the axes are not known; "
             f"state them: axes = {', '.join(AXES)} (key `axes` in the .npz, `# axes = ...` above the "
             "header of a table, or --axes of torchpose fit)"
         )

@@ -175,7 +175,7 @@ def _one_person(
             f"bodies {', '.join(numbers_of)} are taken for one person: never two of them at once"
         )
     if companion:
-        notes.append("another person than the one whose file it is; the file does not say who")
+        notes.append("a further person in the file; the file does not say who")
     away = sorted(set(range(n_frames)) - seen.keys())
     if away:
         notes.append(f"not there in frames {frame_ranges(away)}")

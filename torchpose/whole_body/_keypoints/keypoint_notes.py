@@ -1,4 +1,4 @@
-"""Say in plain words what the keypoints of cameras betray: mirrored videos, cameras that disagree, gaps."""
+"""Say in plain words what the keypoints of cameras show: mirrored videos, cameras that disagree, gaps."""
 
 from collections.abc import Sequence
 
@@ -11,13 +11,13 @@ from torchpose.body._skeleton import BODY_15
 TOO_FEW = "too few keypoints were given"
 """Why a track begins late."""
 
-_DISAGREES = 0.5  # share of a camera's keypoints that are nobody's, above which it is said
+_DISAGREES = 0.5  # share of a camera's keypoints that fit no joint, above which it is said
 _MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
 _GAP = 30  # frames without keypoints that are worth a word
 _LEAST_TURN = (
     0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
 )
-_STRAYS = 30.0  # percent of its frames in which a camera sees somebody where nobody is
+_STRAYS = 30.0  # percent of its frames in which a camera has a detection that fits no person
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
 _DOWN = 0.5  # of a unit vector, along the columns of an image
 _LYING = 60.0  # degrees of the trunk from the axis that points up, from which on it is said
@@ -32,7 +32,9 @@ def late_note(first_frame: int, why: str) -> tuple[str, ...]:
     """
     if first_frame == 0:
         return ()
-    return (f"the first {first_frame} frames, in which {why}, have no pose",)
+    before = "frame" if first_frame == 1 else f"{first_frame} frames"
+    have = "has" if first_frame == 1 else "have"
+    return (f"the first {before}, in which {why}, {have} no pose",)
 
 
 def notes_of(
@@ -187,10 +189,10 @@ def notes_on_turned_cameras(
 def notes_on_strays(
     cameras: Sequence[str], strays: Bool[Tensor, "T C"], there: Bool[Tensor, "T C"]
 ) -> tuple[str, ...]:
-    """Return notes on cameras that see somebody where nobody is.
+    """Return notes on cameras with many detections that fit no tracked person.
 
     Args:
-        cameras: their names. strays: whether a camera had a detection that is nobody's, and none of somebody.
+        cameras: their names. strays: whether a camera had a detection that fits no person, and none of a tracked one.
         there: whether it had any detection.
     """
     share = 100 * strays.sum(0) / there.sum(0).clamp_min(1)
