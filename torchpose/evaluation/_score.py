@@ -162,8 +162,8 @@ def _check_arms(known: Sequence[str]) -> None:
     if known:
         raise OverlapError(
             f"the prior over arms that comes with the package was fitted on {', '.join(known)}; score "
-            "other persons, pass seen=True (--seen true), or take method 'window-mixture' or 'mkf-fixed', which do "
-            "without it"
+            "other persons, pass seen=True (--seen true), or take method 'window-mixture' or 'mkf-fixed', "
+            "which do without it"
         )
 
 

@@ -38,8 +38,8 @@ def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> N
     if 2 * float(weights[outside].sum()) > float(weights.sum()):
         raise CameraError(
             f"{keypoints.path}: {int(outside.sum())} of {len(points)} keypoints lie outside the image of "
-            f"{size[0]} x {size[1]} pixels, most of those with high confidence; if they are of a video of another "
-            "size, give its camera and image_size"
+            f"{size[0]} x {size[1]} pixels, most of those with high confidence; if they are of a video of "
+            "another size, give its camera and image_size"
         )
 
 

@@ -135,7 +135,9 @@ class FileSource(VideoSource):
         if odd_turn:
             self.notes.append("to be shown at an angle that is no multiple of 90 degrees: ignored")
         if frame.interlaced_frame:
-            self.notes.append("interlaced: fast movements have striped edges; deinterlace the file first")
+            self.notes.append(
+                "interlaced: fast movements have striped edges; deinterlace the file first"
+            )
         if frame.color_trc in _HDR:
             self.notes.append(
                 f"high dynamic range ({_HDR[frame.color_trc]}) is not tone-mapped: colours look flat"

@@ -142,7 +142,9 @@ def test_a_note_names_the_camera_whose_detections_are_nobodys():
         for one in tracker(with_turns(rig, (0.0, degrees, 0.0)))(keypoints=pixels, persons="all")
     ]
     assert len(notes) == 4
-    said = [[note for note in own if "detection that fits no tracked person" in note] for own in notes]
+    said = [
+        [note for note in own if "detection that fits no tracked person" in note] for own in notes
+    ]
     assert said[:2] == [[], []]
     for (note,) in said[2:]:
         assert note.startswith("in 100 % of its frames camera c1")

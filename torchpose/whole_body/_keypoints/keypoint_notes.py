@@ -192,7 +192,8 @@ def notes_on_strays(
     """Return notes on cameras with many detections that fit no tracked person.
 
     Args:
-        cameras: their names. strays: whether a camera had a detection that fits no person, and none of a tracked one.
+        cameras: their names. strays: whether a camera had a detection that fits no person, and missed a
+            tracked one.
         there: whether it had any detection.
     """
     share = 100 * strays.sum(0) / there.sum(0).clamp_min(1)
@@ -300,8 +301,8 @@ def notes_on_up(up: str | None, joints: Float[Tensor, "T J 3"]) -> tuple[str, ..
     if angle < _LYING:
         return ()
     return (
-        f"in half of the frames or more the trunk is {angle:.0f} degrees away from {up}, which was given as up; "
-        "if the person is not lying down, another axis points up, and the files of --formats are turned too",
+        f"in half of the frames or more the trunk is {angle:.0f} degrees away from {up}, which was given as "
+        "up; if the person is not lying down, another axis points up, and the files of --formats are turned too",
     )
 
 
