@@ -302,7 +302,8 @@ def notes_on_up(up: str | None, joints: Float[Tensor, "T J 3"]) -> tuple[str, ..
         return ()
     return (
         f"in half of the frames or more the trunk is {angle:.0f} degrees away from {up}, which was given as "
-        "up; if the person is not lying down, another axis points up, and the files of --formats are turned too",
+        "up; if the person is not lying down, another axis points up, and the files of --formats are turned "
+        "too",
     )
 
 
