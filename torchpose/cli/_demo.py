@@ -69,8 +69,8 @@ def run(
     own = "|".join(map(re.escape, (*_VIDEO_FILES, *_KEYPOINT_FILES)))
     with track_results(out, given.files(), pictures, video, expected, own) as results:
         print(
-            "This is a smoke test on an animated performer, with made-up movements and noise. It shows "
-            "that\nthe tracker works, not how well it does on people: see `torchpose evaluate`.\n"
+            "This is a smoke test on an animated performer, with made-up movements and noise.\n"
+            "For the accuracy on people see `torchpose evaluate`.\n"
         )
         demo = demo_video if video else demo_keypoints
         return demo(model, results, seconds, seed, pictures)
