@@ -102,7 +102,7 @@ def test_results_of_a_version_that_kept_no_list(track, tmp_path):
         (out / name).write_bytes(b"old")
     old = content(out)
     done = track("--frame", "body")
-    assert done.code == 0 and "was moved to" in done.out
+    assert done.code == 0 and "were moved to" in done.out
     mine = {"poses_p02_edited_by_me.csv", "notes.txt"}
     assert content(out).keys() == {*POSES, LIST, *mine}
     assert content(out / "earlier-1") == {n: c for n, c in old.items() if n not in mine}

@@ -256,7 +256,7 @@ def test_the_height_of_one_camera_is_an_option(track, scene, tmp_path):
     without = track(tmp_path / "without", *given, "--up", "y")
     done = track(tmp_path / "with", *given, "--up", "y", "--camera-height", 1.2)
     assert (without.code, done.code) == (0, 0), done.err
-    assert "how large" in without.out and "how large" not in done.out
+    assert "size of a person" in without.out and "size of a person" not in done.out
     refused = track(tmp_path, *given, "--camera-height", 1.2)
     assert refused.code == 2 and "give up as well" in refused.err
     refused = track(tmp_path, *MIXED, "--up", "y", "--camera-height", 1.2)

@@ -175,7 +175,7 @@ class ResultsFolder:
         shutil.rmtree(trash, ignore_errors=True)
         if strangers:
             self.notes.append(
-                f"files in the place of results that were not written by this command were moved to "
+                "files in the place of results that are not known to be of this command were moved to "
                 f"{aside}: {_some(strangers)}"
             )
 

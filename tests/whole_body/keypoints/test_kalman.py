@@ -98,8 +98,8 @@ def test_one_camera_tells_the_pose_up_to_size():
     found = track(one, height=1.7)
     pixels = one.rig(found.joints3d).pixels
     assert float((pixels - one.keypoints).norm(dim=-1)[5:].median()) < 15
-    assert not any("how large" in note for note in found.notes)
-    assert any("how large" in note for note in track(one).notes)
+    assert not any("size of a person" in note for note in found.notes)
+    assert any("size of a person" in note for note in track(one).notes)
 
 
 def test_covariances_of_one_camera_have_what_frames_do_not_average_out():
