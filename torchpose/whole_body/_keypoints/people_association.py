@@ -12,11 +12,11 @@ sum of log odds is taken; a person without any above 0 has none.
 import math
 from itertools import combinations
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.assignment import best_columns
 from torchpose.body._articulation import covariances_of
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
@@ -98,7 +98,7 @@ def assign(gains: Float[Tensor, "P C D"]) -> Int[Tensor, "P C"]:
     clash = clash.sum(0) > 1
     for camera in clash.any(0).nonzero().flatten().tolist():
         values = gains[:, camera].clamp_min(0).nan_to_num(0.0).cpu().numpy()
-        chosen = torch.from_numpy(_hungarian(values)).to(wanted)
+        chosen = torch.from_numpy(best_columns(values)).to(wanted)
         gained = gains[:, camera].gather(-1, chosen.clamp_min(0)[:, None]).squeeze(-1)
         wanted[:, camera] = torch.where((chosen >= 0) & (gained > 0), chosen, -1)
     return wanted
@@ -113,43 +113,6 @@ def left_over(gains: Float[Tensor, "P C D"], chosen: Int[Tensor, "P C"]) -> Int[
     owned = owned_detections(chosen, gains.shape[-1])
     rest = gains.masked_fill(owned | (chosen >= 0)[..., None], -math.inf)
     return torch.where(chosen >= 0, chosen, assign(rest))
-
-
-def _hungarian(values: np.ndarray) -> np.ndarray:
-    """Return the column of each row [P], -1 if none, with the largest sum of values that are not negative.
-
-    Shortest augmenting paths with dual prices; rows have columns of their own, of value 0.
-
-    Reference: R. Jonker and A. Volgenant (1987), "A shortest augmenting path algorithm for dense and sparse
-    linear assignment problems", https://doi.org/10.1007/BF02278710.
-    """
-    n_rows, n_columns = values.shape
-    cost = np.hstack([-values, np.zeros((n_rows, n_rows))])
-    row_price, price = np.zeros(n_rows), np.zeros(cost.shape[1])
-    owner = np.full(cost.shape[1], -1)
-    for first in range(n_rows):
-        distance, before = np.full(cost.shape[1], np.inf), np.full(cost.shape[1], -1)
-        done = np.zeros(cost.shape[1], dtype=bool)
-        row, column, reached = first, -1, 0.0
-        while row >= 0:
-            length = reached + cost[row] - row_price[row] - price
-            shorter = ~done & (length < distance)
-            distance[shorter], before[shorter] = length[shorter], column
-            column = int(np.where(done, np.inf, distance).argmin())
-            reached, row = distance[column], owner[column]
-            done[column] = True
-        inside = done & (owner >= 0)
-        row_price[first] += reached
-        row_price[owner[inside]] += reached - distance[inside]
-        price[done] -= reached - distance[done]
-        while column >= 0:
-            earlier = before[column]
-            owner[column] = first if earlier < 0 else owner[earlier]
-            column = earlier
-    found = np.full(n_rows, -1)
-    real = (owner >= 0) & (np.arange(len(owner)) < n_columns)
-    found[owner[real]] = np.nonzero(real)[0]
-    return found
 
 
 def owned_detections(chosen: Int[Tensor, "P C"], count: int) -> Bool[Tensor, "C D"]:
