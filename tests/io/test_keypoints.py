@@ -394,6 +394,11 @@ def person(x: float, confidence: float = 0.8, joints: int = 25) -> dict:
     return {"pose_keypoints_2d": values.ravel().tolist()}
 
 
+def standing(x: float, confidence: float) -> dict:
+    values = [[x + 10 * (i % 5), 100.0 + 20 * i, confidence] for i in range(25)]
+    return {"pose_keypoints_2d": np.ravel(values).tolist()}
+
+
 def frame(folder, number: int | str, *people: dict):
     folder.mkdir(exist_ok=True)
     label = f"{number:012d}" if isinstance(number, int) else number
@@ -475,12 +480,39 @@ def test_noise_does_not_hide_the_order_of_an_upper_body(tmp_path, layout):
 def test_the_most_confident_person_is_followed(tmp_path):
     folder = tmp_path / "json"
     frame(folder, 0)
-    frame(folder, 1, person(500, 0.5), person(100, 0.9), person(300, 0.7))
-    frame(folder, 2, person(490, 0.95), person(120, 0.4))  # another one is more confident now
-    frame(folder, 3, {"pose_keypoints_2d": []}, person(480, 0.9))  # ours is not there
-    frame(folder, 4, person(470, 0.5), person(130, 0.9))
+    frame(folder, 1, standing(900, 0.5), standing(100, 0.9), standing(500, 0.7))
+    frame(folder, 2, standing(890, 0.95), standing(110, 0.4))  # another one is more confident now
+    frame(folder, 3, {"pose_keypoints_2d": []}, standing(880, 0.9))  # ours is not there
+    frame(folder, 4, standing(870, 0.5), standing(130, 0.9))
     read = read_keypoints(folder)
-    assert read.keypoints[1:, 0, 0].tolist() == [100, 120, 480, 470]
+    assert read.keypoints[1:, 0, 0].nan_to_num(-1).tolist() == [100, 110, -1, 130]
+
+
+def test_somebody_who_passes_is_not_taken_for_the_hidden_person(tmp_path):
+    folder = tmp_path / "json"
+    for number, x in enumerate(np.linspace(900, -700, 80).round()):
+        passing, ours = standing(x, 0.7), standing(100, 0.9)
+        hidden = abs(x - 100) < 150
+        frame(folder, number, passing, *([] if hidden else [ours]))
+    places = read_keypoints(folder).keypoints[:, 0, 0].nan_to_num(-1).tolist()
+    assert set(places) == {-1.0, 100.0} and places[-1] == 100.0
+
+
+def test_a_person_who_stays_away_is_followed_again_and_a_neighbour_is_not(tmp_path):
+    folder = tmp_path / "json"
+    for number in range(150):
+        away = 20 <= number < 140
+        frame(folder, number, standing(500, 0.7), *([] if away else [standing(100 + number, 0.9)]))
+    places = read_keypoints(folder).keypoints[:, 0, 0].nan_to_num(-1).tolist()
+    assert places[20:140] == [-1.0] * 120 and places[140:] == [240.0 + i for i in range(10)]
+
+
+def test_second_detections_do_not_end_the_following(tmp_path):
+    folder = tmp_path / "json"
+    frame(folder, 0, standing(100, 0.9), standing(104, 0.8))
+    for number in range(1, 9):
+        frame(folder, number, standing(104 + number, 0.8))
+    assert read_keypoints(folder).measured.all()
 
 
 def test_nothing_in_common_means_the_most_confident(tmp_path):

@@ -229,7 +229,7 @@ def _crowd_notes(
     from torchpose.io._keypoints import said_of_crowd
 
     for part, camera in zip(parts, cameras, strict=True):
-        if crowd := said_of_crowd(part.n_people):
+        if crowd := said_of_crowd(part.n_people, part.points[:, 0]):
             yield f"camera {camera.name}: {crowd}, and --persons all tracks everybody"
 
 

@@ -79,18 +79,24 @@ class Keypoints:
         return torch.isfinite(self.keypoints).all(-1)
 
 
-def said_of_crowd(n_people: Tensor | None) -> str:
+def said_of_crowd(n_people: Tensor | None, points: Tensor) -> str:
     """Return a phrase about several people in the frames, of whom one is followed; empty without.
 
     Args:
-        n_people: how many are in each frame [T], None if one is.
+        n_people: how many are in each frame [T], None if one is. points: of the followed person [T, J, 2], pixels.
     """
     several = torch.zeros(0) if n_people is None else (n_people > 1).nonzero()
     if n_people is None or not len(several):
         return ""
+    seen = points.isfinite().all(-1)
+    first = int(seen.any(-1).int().argmax())
+    u, v = points[first][seen[first]].mean(0).tolist()
+    missing = int((~seen.any(-1) & (n_people > 0)).sum())
     return (
         f"several people, up to {int(n_people.max())}, from frame {int(several[0])} on; one of them is "
-        "tracked"
+        f"tracked, about pixel ({u:.0f}, {v:.0f}) in frame {first}"
+        + f", who is missing in {missing} frames that show others"
+        * bool(missing)
     )
 
 

@@ -52,7 +52,7 @@ def doubts_about(
         keypoints: of a file. neck_is_told: whether their neck is known to be the prior's, or not to be.
         up: the direction that points up, camera axes, [3]; by default the camera is about level.
     """
-    if crowd := said_of_crowd(keypoints.n_people):
+    if crowd := said_of_crowd(keypoints.n_people, keypoints.keypoints):
         yield crowd
     if keypoints.first_frame:
         yield f"frame 0 is number {keypoints.first_frame} of the file"

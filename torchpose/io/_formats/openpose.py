@@ -3,10 +3,8 @@
 Other programs write the same files with the joint sets of their detectors, as Pose2Sim does. How many
 keypoints a person has tells the set.
 
-Of several people one is followed: in the first frame with people the one of largest mean confidence,
-afterwards the one nearest to the last frame in which that person was seen (mean pixel distance over
-the keypoints that both have); where nothing can be compared, again the one of largest mean
-confidence. An empty list of people is a frame without measurements.
+Of several people one is followed, the one of largest mean confidence in the first frame with people
+(`torchpose.io._formats.followed_person`). An empty list of people is a frame without measurements.
 """
 
 import re
@@ -18,6 +16,7 @@ import numpy as np
 
 from torchpose._core.reading import check_span, read_json, reading
 from torchpose.errors import FileFormatError, InputError, NobodySeenError
+from torchpose.io._formats.followed_person import follow_person
 from torchpose.skeleton._joint_sets import COCO, SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
@@ -88,12 +87,7 @@ def read_openpose(folder: str | Path) -> OpenPosePerson:
             JSON, or another number of keypoints; the file is named.
     """
     frames, names, first = _read_frames(folder)
-    table = np.zeros((len(frames), len(names), 3))
-    followed = None
-    for row, group in enumerate(frames):
-        if group:
-            followed = _pick(np.stack(group), followed)
-            table[row] = followed
+    table = follow_person(frames, len(names))
     n_people = np.array([len(group) for group in frames])
     return OpenPosePerson(*_measured(table), names, n_people, first)
 
@@ -222,15 +216,3 @@ def _off_middle(
     seen = pixels[known]
     extent = (np.nanmax(seen, 1) - np.nanmin(seen, 1)).max(-1)
     return float(np.median(away[known] / np.maximum(extent, 1e-9)))
-
-
-def _pick(people: np.ndarray, followed: np.ndarray | None) -> np.ndarray:
-    """Return the person [J, 3] to follow among [P, J, 3]."""
-    if followed is not None and len(people) > 1:
-        both = (people[..., 2] > 0) & (followed[:, 2] > 0)
-        gaps = np.linalg.norm(people[..., :2] - followed[:, :2], axis=-1)
-        shared = both.sum(-1)
-        if shared.any():
-            distance = np.where(both, gaps, 0.0).sum(-1) / np.maximum(shared, 1)
-            return people[int(np.where(shared > 0, distance, np.inf).argmin())]
-    return people[int(people[..., 2].mean(-1).argmax())]
