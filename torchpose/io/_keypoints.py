@@ -83,7 +83,8 @@ def said_of_crowd(n_people: Tensor | None, points: Tensor) -> str:
     """Return a phrase about several people in the frames, of whom one is followed; empty without.
 
     Args:
-        n_people: how many are in each frame [T], None if one is. points: of the followed person [T, J, 2], pixels.
+        n_people: how many are in each frame [T], None if one is. points: of the followed person
+            [T, J, 2], pixels.
     """
     several = torch.zeros(0) if n_people is None else (n_people > 1).nonzero()
     if n_people is None or not len(several):
