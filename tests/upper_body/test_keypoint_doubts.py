@@ -49,6 +49,20 @@ def test_somebody_who_faces_the_camera_raises_no_doubt():
     assert notes(keypoints(), camera().up) == ""
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_forearm_that_is_much_shorter_than_the_other(side):
+    given = keypoints(40)
+    elbow, wrist = (NAMES.index(f"{side}_{joint}") for joint in ("elbow", "wrist"))
+    whole = given.keypoints[:, wrist] - given.keypoints[:, elbow]
+    shares = torch.linspace(0.05, 0.7, 40, dtype=torch.float64)[:, None]
+    given.keypoints[:, wrist] = given.keypoints[:, elbow] + shares * whole
+    assert notes(given) == ""
+    given.keypoints[:, wrist] = given.keypoints[:, elbow] + 0.5 * shares * whole
+    assert f"the {side} forearm looks at most 33 % as long" in notes(given)
+    given.keypoints[10:, wrist] = torch.nan
+    assert notes(given) == ""
+
+
 def test_rows_that_count_upwards():
     flipped = keypoints()
     flipped.keypoints[..., 1] = 480 - flipped.keypoints[..., 1]
