@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpose._core.uncompiled import is_exporting
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import (
     CovarianceError,
@@ -29,8 +30,7 @@ def refuse_export(what: str, instead: str) -> None:
     Args:
         what: name of what cannot be exported. instead: name of what can.
     """
-    is_exporting = getattr(torch.compiler, "is_exporting", None)  # not in all releases
-    if is_exporting is not None and is_exporting():
+    if is_exporting():
         raise InputError(f"{what} cannot be exported; export {instead}")
 
 

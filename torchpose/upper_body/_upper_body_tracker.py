@@ -24,6 +24,7 @@ from torchpose._core.module_state import (
     wide_or_parameter,
     working_precision,
 )
+from torchpose._core.uncompiled import uncompiled
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._tilt import angles_of_up
 from torchpose.errors import InputError
@@ -241,6 +242,7 @@ class UpperBodyTracker(WideModule):
             model = model._replace(hand=picked.hand, middle=(picked.middle, picked.middle_alone))
         return make(model, **self.given_options)
 
+    @uncompiled
     def forward(
         self,
         keypoints: Float[Tensor, "B T J 2"],
@@ -301,6 +303,7 @@ class UpperBodyTracker(WideModule):
             _, track = reader.read(None, estimates, found, lengths)
         return note_collapse(track.in_precision(self.dtype))
 
+    @uncompiled
     def init(
         self, batch_size: int, names: Sequence[str] | None = None, generator: Generators = None
     ) -> StreamState:
@@ -341,6 +344,7 @@ class UpperBodyTracker(WideModule):
         unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
         return StreamState(state, None, unseen, n_keypoints, picked, method=reader.method)
 
+    @uncompiled
     def step(
         self,
         state: StreamState,
@@ -380,6 +384,7 @@ class UpperBodyTracker(WideModule):
         state, track = self.advance(state, keypoints[:, None], *of_frame)
         return state, live_pose(track, state.unseen / (self.fps or 30.0))
 
+    @uncompiled
     def advance(
         self,
         state: StreamState,

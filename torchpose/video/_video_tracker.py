@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
 from torchpose._core.module_state import derived
+from torchpose._core.uncompiled import uncompiled
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import InputError
 from torchpose.measure._association import HandAssociation
@@ -232,6 +233,7 @@ class VideoTracker(nn.Module):
         """Return the state before the first frame."""
         return VideoState(self.measurer.init(), {}, {})
 
+    @uncompiled
     def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
         """Return the next state and the persons in one more frame of a camera.
 
@@ -249,6 +251,7 @@ class VideoTracker(nn.Module):
         last = {number: tracked[number][-1] for number in state.streams}
         return state, [LivePerson(n, part.poses, part.measured) for n, part in last.items()]
 
+    @uncompiled
     def advance(
         self, state: VideoState, images: Iterable[Any] | Tensor
     ) -> tuple[VideoState, dict[int, list[TrackedBlock]]]:
@@ -277,6 +280,7 @@ class VideoTracker(nn.Module):
             place, last = place + len(block.found), after
         return last, tracked
 
+    @uncompiled
     def forward(
         self,
         frames: Iterable[Any] | Tensor,

@@ -15,6 +15,7 @@ from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import as_one_run, in_own_precision
 from torchpose._core.moved import warn_of_former
+from torchpose._core.uncompiled import uncompiled
 from torchpose.body._kinematics import Body
 from torchpose.camera._choice import check_room
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
@@ -235,6 +236,7 @@ class BodyTracker(nn.Module):
         """Move the tensors, as `to` asks for, and keep their precision: that of filters is double."""
         return super()._apply(in_own_precision(fn), recurse)
 
+    @uncompiled
     @takes_former_arguments
     @torch.no_grad()
     @as_one_run
@@ -335,6 +337,7 @@ class BodyTracker(nn.Module):
         poses.notes += late_note(begun, unseen)
         return poses
 
+    @uncompiled
     @takes_former_arguments
     @torch.no_grad()
     @as_one_run
@@ -420,6 +423,7 @@ class BodyTracker(nn.Module):
         persons: str | int,
     ) -> tuple[BodyStream, list[BodyTrack]]: ...
 
+    @uncompiled
     @torch.no_grad()
     @as_one_run
     def step(
@@ -471,6 +475,7 @@ class BodyTracker(nn.Module):
             pose.first_frame = state.frame
         return state._replace(filter=after, frame=state.frame + 1), found
 
+    @uncompiled
     @torch.no_grad()
     @as_one_run
     def advance(
