@@ -43,7 +43,8 @@ class LivePose(NamedTuple):
     Attributes:
         joints2d: [B, 8, 2], pixels of the camera; joints in the order of `UPPER_BODY`.
         joints3d: [B, 8, 3], metres, in the tracker's frame.
-        covariance2d: [B, 8, 2, 2], pixels squared. covariance3d: [B, 8, 3, 3], metres squared.
+        covariance2d: [B, 8, 2, 2], pixels squared. covariance3d: [B, 8, 3, 3], metres squared, relative to
+            the body; see `PoseTrack`.
         observed: [B, 8], True where the joint was measured in this frame, by no outlier.
         log_evidence: [B, 2], the increment of the left and of the right arm; see `PoseTrack`.
         effective_sample_size: [B, 2], that of the particles or tracks of each arm; see `PoseTrack`.

@@ -66,7 +66,8 @@ class PoseTrack:
             there; where bones of constant length do not reach, `joints3d` project elsewhere.
         joints3d: [B, T, 8, 3], the joints in space, metres, in the axes of `frame`.
         covariance2d: [B, T, 8, 2, 2], their covariances, pixels squared.
-        covariance3d: [B, T, 8, 3, 3], their covariances, metres squared.
+        covariance3d: [B, T, 8, 3, 3], their covariances, metres squared, in the same axes and relative to
+            the body. How far it is from the camera is much less certain, and is not in them.
         observed: [B, T, 8], True where the joint was measured, False where it was inferred because no
             keypoint was given or it was an outlier.
         log_evidence: [B, T, 2], the increments log p(z_t | z_1:t-1) of the left and of the right arm.
