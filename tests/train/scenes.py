@@ -44,5 +44,5 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 
 def make_hole(arrays: dict[str, Any]) -> None:
-    """Take a joint out of one frame of a recording."""
-    arrays["joints"][9, 4] = np.nan
+    """Take a joint out of all frames of a recording but the first nine."""
+    arrays["joints"][9:, 4] = np.nan

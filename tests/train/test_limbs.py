@@ -131,6 +131,6 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         (["--data.init_args.fps", "0"], "fps must be positive"),
         (["--model.init_args.least_std", "-1"], "least_std must be zero or more"),
         (["--data", "train.data.RecordingsDataModule"], "train.limbs.LimbData"),
-        ([*nobody, f"['{folders['holes']}']"], "p6_0.npz: left_elbow is missing in frame 9"),
+        ([*nobody, f"['{folders['holes']}']"], "p6_0.npz: no half a second in which all joints are there"),
         ([*nobody, f"['{folders['timeless']}']"], "does not say its frame rate"),
     )  # fmt: skip
