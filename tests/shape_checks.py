@@ -3,7 +3,8 @@
 `install` is called before the package is imported. Every annotated function of it, nested ones
 included, is then checked by jaxtyping and beartype once it has returned. The outcome of a check
 depends on types, dtypes and shapes alone, so a function is checked once for each combination of them,
-and later calls with the same combination go through.
+and later calls with the same combination go through. Of functions that are called very often every eighth
+call is looked at.
 """
 
 import ast
@@ -28,6 +29,10 @@ from torch import Tensor
 __all__ = ["check_after_call", "checked", "install"]
 
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+_ALWAYS, _THEN_EVERY = (
+    500,
+    8,
+)  # calls of a function that are looked at: the first ones, then every n-th
 _NAME = "@checked"  # of the decorator in a module; no name of the module itself can be like it
 _MOST_ITEMS = 32  # of a collection that is told from others by its items
 _ARRAYS, _SEQUENCES = (Tensor, np.ndarray), (tuple, list)
@@ -80,10 +85,15 @@ def checked(function: Any) -> Any:
     check = _check_of(function)
     looked_at, named, returns = check.looked_at, check.named, check.returns
     plain, passed, most = check.plain, check.passed, len(check.looked_at)
+    calls = 0
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
+        nonlocal calls
+        calls += 1
+        if calls > _ALWAYS and calls % _THEN_EVERY:
+            return function(*args, **kwargs)
         returned = function(*args, **kwargs)
         # Nearly all calls end here, millions in a run: no call is made that can be left out.
         try:

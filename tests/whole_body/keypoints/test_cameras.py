@@ -266,7 +266,7 @@ def scaled(rig, factor):
 def test_cameras_in_other_units_are_refused_with_their_factor(factor):
     given = scene(2, 10, noise=6.0)
     tracker = BodyTracker(scaled(given.rig, factor), "kalman", fps=FPS)
-    with pytest.raises(CameraError, match="in metres, and as they are given") as told:
+    with pytest.raises(CameraError, match="in metres, but with these cameras") as told:
         tracker(keypoints=given.keypoints)
     found = float(re.search(r"about (\S+) times", str(told.value))[1])
     assert found == pytest.approx(factor, rel=0.15)
@@ -277,7 +277,7 @@ def test_cameras_in_feet_are_refused_by_particles_and_for_several_persons(method
     given = scene(3, 20)
     tracker = BodyTracker(scaled(given.rig, 3.28), method, fps=FPS)
     several = {"persons": "all", "keypoints": given.keypoints[:, :, None]}
-    with pytest.raises(CameraError, match="in metres, and as they are given"):
+    with pytest.raises(CameraError, match="in metres, but with these cameras"):
         tracker(**(several if method == "kalman" else {"keypoints": given.keypoints}))
 
 

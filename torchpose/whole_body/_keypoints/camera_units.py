@@ -36,7 +36,7 @@ def check_units(filter: BodyKalmanFilter, frames: KeypointFrame) -> None:
     if not _SHORTEST < factor < _LONGEST:
         raise CameraError(
             "cameras must be given in metres, but with these cameras the bones of the person come out about "
-            f"{factor:.2g} times too long; divide translations in millimetres by 1000, those in "
+            f"{factor:.2g} times as long as anybody's; divide translations in millimetres by 1000, those in "
             "centimetres by 100, and those in an unknown unit by about that factor. If they are in metres, "
             "check the direction of rotation and translation: they must lead from world to camera axes"
         )
