@@ -4,7 +4,7 @@
 included, is then checked by jaxtyping and beartype once it has returned. The outcome of a check
 depends on types, dtypes and shapes alone, so a function is checked once for each combination of them,
 and later calls with the same combination go through. Of functions that a test calls very often every
-eighth call is looked at.
+thirty-second call is looked at after the first ones.
 """
 
 import ast

@@ -33,12 +33,11 @@ FILTERS = (*KALMAN, *PARTICLES)
 # The two random walks differ by one term of the weights: one of them is compiled, the other exported.
 # What aot_eager compiles, it traces as eager does. A run that is compiled has the steps in it.
 TRACED = (
-    *(f"eager/step/{name}" for name in ("medians", "mixture", "random-walk-unscaled")),
+    *(f"eager/step/{name}" for name in ("medians", "random-walk-unscaled")),
     *(f"export/step/{name}" for name in ("fixed", "split", "sampled", "random-walk")),
     "aot_eager/step/fixed",
     "export/run/fixed",
     *(f"eager/run/{name}" for name in ("split", "sampled")),
-    "export/smoothing/fixed",
     "eager/smoothing/fixed",
     "eager/smoothing/medians",
 )
