@@ -24,10 +24,6 @@ def pytest_addoption(parser):
     )
 
 
-def pytest_runtest_setup(item):
-    shape_checks.begin_test()
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
     """Leave modules and tests, millions of objects that stay, out of all collections of garbage."""

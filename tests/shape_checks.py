@@ -3,8 +3,7 @@
 `install` is called before the package is imported. Every annotated function of it, nested ones
 included, is then checked by jaxtyping and beartype once it has returned. The outcome of a check
 depends on types, dtypes and shapes alone, so a function is checked once for each combination of them,
-and later calls with the same combination go through. Of functions that a test calls very often every
-thirty-second call is looked at after the first ones.
+and later calls with the same combination go through.
 """
 
 import ast
@@ -26,28 +25,15 @@ from beartype.roar import BeartypeDecorHintPep673Exception
 from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 
-__all__ = ["begin_test", "check_after_call", "checked", "install"]
+__all__ = ["check_after_call", "checked", "install"]
 
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
-_ALWAYS, _THEN_EVERY = (
-    500,
-    8,
-)  # calls of a function that are looked at: the first ones, then every n-th
 _NAME = "@checked"  # of the decorator in a module; no name of the module itself can be like it
 _MOST_ITEMS = 32  # of a collection that is told from others by its items
 _ARRAYS, _SEQUENCES = (Tensor, np.ndarray), (tuple, list)
 _COLLECTIONS = (Sequence, Mapping, Set, deque)
 _PLAIN: set[type] = {range, int, float, types.NoneType}  # types that are facts enough
 _PLAIN_AND_WORDS: set[type] = {*_PLAIN, str}  # where no Literal tells words apart
-
-
-_tests_begun = 0
-
-
-def begin_test() -> None:
-    """Look at the first calls of all functions again."""
-    global _tests_begun
-    _tests_begun += 1
 
 
 def install(package: str) -> None:
@@ -94,17 +80,10 @@ def checked(function: Any) -> Any:
     check = _check_of(function)
     looked_at, named, returns = check.looked_at, check.named, check.returns
     plain, passed, most = check.plain, check.passed, len(check.looked_at)
-    calls, of_test = 0, 0
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        nonlocal calls, of_test
-        if of_test != _tests_begun:
-            calls, of_test = 0, _tests_begun
-        calls += 1
-        if calls > _ALWAYS and calls % _THEN_EVERY:
-            return function(*args, **kwargs)
         returned = function(*args, **kwargs)
         # Nearly all calls end here, millions in a run: no call is made that can be left out.
         try:

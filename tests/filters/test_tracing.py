@@ -1,11 +1,5 @@
 """Steps that have no values to look at: exported, compiled, vectorised; the numbers of plain steps."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from torch.utils import _pytree as pytree
@@ -24,6 +18,7 @@ from tests.filters.traced_steps import (
     seeded,
     sequences,
 )
+from tests.without_shape_checks import differences_of
 from torchpose._core.checks import check_covariance
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import CovarianceError, InputError, ShapeError
@@ -33,11 +28,12 @@ FILTERS = (*KALMAN, *PARTICLES)
 # The two random walks differ by one term of the weights: one of them is compiled, the other exported.
 # What aot_eager compiles, it traces as eager does. A run that is compiled has the steps in it.
 TRACED = (
-    *(f"eager/step/{name}" for name in ("medians", "random-walk-unscaled")),
+    *(f"eager/step/{name}" for name in ("medians", "mixture", "random-walk-unscaled")),
     *(f"export/step/{name}" for name in ("fixed", "split", "sampled", "random-walk")),
     "aot_eager/step/fixed",
     "export/run/fixed",
     *(f"eager/run/{name}" for name in ("split", "sampled")),
+    "export/smoothing/fixed",
     "eager/smoothing/fixed",
     "eager/smoothing/medians",
 )
@@ -45,13 +41,8 @@ TRACED = (
 
 @pytest.fixture(scope="module")
 def differences():
-    """Of every traced step; in a process without shape checks, which are not for tracing."""
-    root = Path(__file__).parents[2]
-    environment = os.environ | {"PYTHONPATH": str(root), "TORCHPOSE_SHAPE_CHECKS": "0"}
-    command = [sys.executable, "-m", "tests.filters.traced_steps", *TRACED]
-    run = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr[-4000:]
-    return dict(json.loads(line) for line in run.stdout.splitlines())
+    """Of every traced step."""
+    return differences_of("tests.filters.traced_steps", *TRACED)
 
 
 @pytest.mark.parametrize("case", TRACED)
