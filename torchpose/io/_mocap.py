@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording, read_recordings
+from torchpose.math._hermite import hermite
 
 _UNNAMED = "unnamed"
 
@@ -112,12 +113,7 @@ def resample_frames(
     padded = torch.cat([_before(points), points, _before(points.flip(0))])
     slope = (padded[2:] - padded[:-2]) / 2
     after = (k + 1).clamp_max(len(points) - 1)
-    return (
-        (2 * s**3 - 3 * s**2 + 1) * points[k]
-        + (s**3 - 2 * s**2 + s) * slope[k]
-        + (3 * s**2 - 2 * s**3) * points[after]
-        + (s**3 - s**2) * slope[after]
-    )
+    return hermite(s, (points[k], points[after]), (slope[k], slope[after]))
 
 
 def _before(points: Float[Tensor, "T *rest"]) -> Float[Tensor, "1 *rest"]:

@@ -27,6 +27,7 @@ from torchpose.demo._rendering.look import smooth_noise
 from torchpose.demo._rendering.paint import Array, Capsule, paint_capsule
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip
+from torchpose.math._hermite import hermite
 
 # Flexion in degrees at shares of the cycle from one heel strike to the next of the same foot, after the
 # normal curves in textbooks of gait analysis (loading, mid stance, push-off, swing). Knees are 8 degrees
@@ -197,10 +198,7 @@ def _curve(
     )
     start, end = at[1:-1][k], at[2:][k]
     s, h = (x - start) / (end - start), end - start
-    return (
-        (2 * s**3 - 3 * s**2 + 1) * value[1:-1][k] + (s**3 - 2 * s**2 + s) * h * slope[k]
-        + (3 * s**2 - 2 * s**3) * value[2:][k] + (s**3 - s**2) * h * slope[k + 1]
-    )  # fmt: skip
+    return hermite(s, (value[1:-1][k], value[2:][k]), (slope[k], slope[k + 1]), h)
 
 
 _SHIRT, _SKIN, _TROUSERS, _SHOES = (44, 84, 158), (206, 150, 120), (34, 58, 108), (236, 236, 240)
