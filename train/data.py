@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
@@ -75,10 +75,9 @@ class RecordingsDataModule(LightningDataModule):
         """Read and split recordings, and list the mixtures; the second call does nothing."""
         if self.tasks:
             return
-        self.train, self.watched, self.report = read_sides(
+        self.train, self.watched, self.report, self.unread = read_sides(
             self._paths, self._axes, self._persons, self._held_out, self._curation
         )
-        self.unread = notes_on_unread_files([expand_path(path) for path in self._paths])
         self.tasks = self.recipe.tasks(self.train)
         self.sources = {Key(name): cached(task.source) for name, task in self.tasks.items()}
         if self.watched:
@@ -129,14 +128,28 @@ class RecordingsDataModule(LightningDataModule):
         )
 
 
+class Sides(NamedTuple):
+    """Holds recordings to fit to and those of held-out persons.
+
+    Attributes:
+        report: on what was left out of the former; None if they are as they were read. unread: notes on
+            files that may be recordings and were passed over.
+    """
+
+    train: list[Recording]
+    watched: list[Recording]
+    report: CurationReport | None
+    unread: list[str]
+
+
 def read_sides(
     paths: Sequence[str],
     axes: str | None,
     persons: Sequence[str] | None,
     held_out: Sequence[str],
     curation: CurationSettings | None,
-) -> tuple[list[Recording], list[Recording], CurationReport | None]:
-    """Read recordings to fit to and those of held-out persons, and report what was left out of the former.
+) -> Sides:
+    """Read recordings to fit to and those of held-out persons.
 
     Both sides are curated apart, so that nothing of the held-out persons gets into what is fitted.
 
@@ -144,12 +157,15 @@ def read_sides(
         paths: folders or files, see `expand_path`. axes: of all recordings, or None.
         persons, held_out: see `split`. curation: None takes recordings as they are.
     """
-    files = find_recordings([expand_path(path) for path in paths])
+    given = [expand_path(path) for path in paths]
+    files = find_recordings(given)
+    unread = notes_on_unread_files(given, files)
     train, watched = split(read_recordings(files, axes), persons, held_out)
     if curation is None:
-        return train, watched, None
+        return Sides(train, watched, None, unread)
     kept, report = curate(train, curation)
-    return kept, curate(watched, curation).recordings if watched else [], report
+    watched = curate(watched, curation).recordings if watched else []
+    return Sides(kept, watched, report, unread)
 
 
 def split(

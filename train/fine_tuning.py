@@ -96,9 +96,8 @@ class FineTuningData(LightningDataModule):
                 "fine-tuning stops when persons who are not tuned to are tracked best: name at least "
                 "one with --data.init_args.held_out"
             )
-        self.train, self.watched, _ = read_sides(
-            self._paths, self._axes, self._persons, self._held_out, self._curation
-        )
+        sides = read_sides(self._paths, self._axes, self._persons, self._held_out, self._curation)
+        self.train, self.watched = sides.train, sides.watched
 
     def train_dataloader(self) -> _Numbers:
         """Return the steps of an epoch."""

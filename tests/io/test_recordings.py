@@ -285,13 +285,14 @@ def test_find_recordings(tmp_path):
     assert [p.name for p in found] == ["a.npz", "b.npz", "Ges.csv"]
     assert find_recordings([tmp_path / "set", tmp_path, found[1]]) == found
     assert [len(r) for r in read_recordings([tmp_path])] == [4, 4, 5]
-    beside, other = notes_on_unread_files(tmp_path)
+    beside, other = notes_on_unread_files(tmp_path, find_recordings(tmp_path))
     assert (
         "holds recordings as .npz" in beside and beside.count(".csv") == 1 and "raw.csv" in beside
     )
     assert "do not begin as a recording does" in other and "keypoints.csv" in other
-    assert notes_on_unread_files([tmp_path, tmp_path / "set" / "raw.csv"]) == [other]
-    assert notes_on_unread_files(found) == []
+    both = [tmp_path, tmp_path / "set" / "raw.csv"]
+    assert notes_on_unread_files(both, find_recordings(both)) == [other]
+    assert notes_on_unread_files(found, find_recordings(found)) == []
 
 
 def test_nothing_found(tmp_path):

@@ -114,8 +114,9 @@ def run(
 
     _check_options(given)
     file = check_fit_file(out)
-    everything = read_recordings(find_recordings(recordings), axes)
-    unread = notes_on_unread_files(recordings)
+    found = find_recordings(recordings)
+    everything = read_recordings(found, axes)
+    unread = notes_on_unread_files(recordings, found)
     pictures = pictures_possible(pictures)
     kept, said, facts = _curated(_without(everything, without or []), curation if curate else None)
     words = {"name": name or file.stem, "licence": licence, "command": given.line(out)}

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from torchpose._core.wording import first_of
+
 Facts = dict[str, str]
 _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
 
@@ -24,7 +26,7 @@ def describe_manifold(path: Path) -> Facts:
         "noise": "for the filter" if known else "not fitted yet: the filter needs fit_gplvm_noise",
         "fps": _number(info.fps),
         "held-out error": _number(info.extra.get("held_out_error")),
-        "actions": _listed(info.actions),
+        "actions": first_of(info.actions, _LISTED),
         **_origin(info),
         "track with": "torchpose track-body --manifold NAME|FILE",
     }
@@ -51,7 +53,7 @@ def describe_limbs(path: Path) -> Facts:
         "frames": str(info.n_frames),
         "limbs": "\n".join(rows),
         "held out": _held_out(info.extra),
-        "actions": _listed(info.actions),
+        "actions": first_of(info.actions, _LISTED),
         **_origin(info),
         "track with": "torchpose track-body --method root --conditionals NAME|FILE",
     }
@@ -131,7 +133,7 @@ def describe_body_motion(path: Path) -> Facts:
         "fps": _number(info.fps),
         "frames": str(info.n_frames or ""),
         "held out": _moved(info.extra),
-        "actions": _listed(info.actions),
+        "actions": first_of(info.actions, _LISTED),
         **_origin(info),
     }
 
@@ -200,18 +202,13 @@ def _held_out(extra: dict[str, Any]) -> str:
 
 
 def _origin(info: Any) -> Facts:
-    persons = f"{len(info.persons)}: {_listed(info.persons)}" if info.persons else ""
+    persons = f"{len(info.persons)}: {first_of(info.persons, _LISTED)}" if info.persons else ""
     return {
         "persons": persons,
-        "sources": _listed(getattr(info, "sources", ()), "; ", _SOURCES),
+        "sources": first_of(getattr(info, "sources", ()), _SOURCES, "; "),
         "licence": info.licence,
         "command": info.command,
     }
-
-
-def _listed(names: tuple[str, ...], between: str = ", ", most: int = _LISTED) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return between.join(names[:most]) + more
 
 
 def _number(value: float | None) -> str:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpose.io._recordings import (
     BACK_TO_CAMERA,
     Recording,
+    find_recordings,
     notes_on_unread_files,
     read_recordings,
 )
@@ -67,7 +68,8 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
     Raises:
         InputError, FileFormatError, SkeletonError, MissingDependencyError: as `read_recordings`.
     """
-    recordings = read_recordings(paths)
+    found = find_recordings(paths)
+    recordings = read_recordings(found)
     known = [r for r in recordings if not r.companion]
     others = [r for r in recordings if r.companion]
     files = sorted({r.path.name for r in others if r.path is not None})
@@ -75,7 +77,7 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
         f"Other people in {', '.join(files)} are left out ({len(others)} recordings): nobody says who "
         "they are."
     ] * bool(others)
-    doubts = [*same_names(known), *unstated_rates(known), *notes_on_unread_files(paths)]
+    doubts = [*same_names(known), *unstated_rates(known), *notes_on_unread_files(paths, found)]
     notes += [f"{note}." for note in doubts]
     turned = [r for r in known if BACK_TO_CAMERA in r.notes]
     notes += [f"In {len(turned)} of {len(known)} recordings: {BACK_TO_CAMERA}."] * bool(turned)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_rate
 from torchpose._core.reading import npz_keys, reading, require_file
+from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.io._formats.axes import (
     axes_rotation,
@@ -55,7 +56,7 @@ BACK_TO_CAMERA = (
 )
 """The note on a recording of joints that are perhaps mirrored."""
 _BESIDE_BODY = 0.3  # of its size: how far outside its other joints a centred body's origin may be
-_SHOWN_JOINTS = 3
+_SHOWN_JOINTS, _LISTED = 3, 2  # joints, and files, that a note names
 _BACK = 2 * math.pi / 3  # of the mean heading, from where on the back is to the camera
 _FAR = 1e9  # in the unit of the file; no joint is there
 
@@ -214,7 +215,7 @@ def find_recordings(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     Raises:
         InputError: no such path, or no recording in any of them.
     """
-    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(p) for p in paths]
+    given = _as_paths(paths)
     found: list[Path] = []
     for path in given:
         if path.is_dir():
@@ -232,15 +233,16 @@ def find_recordings(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def notes_on_unread_files(paths: str | Path | Iterable[str | Path]) -> list[str]:
+def notes_on_unread_files(
+    paths: str | Path | Iterable[str | Path], found: Iterable[Path]
+) -> list[str]:
     """Return notes on files in folders that `find_recordings` passes over though they may be recordings.
 
     Args:
-        paths: one path or several, as for `find_recordings`; files are read anyway.
+        paths: one path or several, as given to `find_recordings`. found: what that returned.
     """
-    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(p) for p in paths]
-    read = set(find_recordings(given))
-    files = [f for p in given if p.is_dir() for f in sorted(p.rglob("*")) if f.is_file()]
+    read = set(found)
+    files = [f for p in _as_paths(paths) if p.is_dir() for f in sorted(p.rglob("*")) if f.is_file()]
     unread = [f for f in dict.fromkeys(files) if f not in read and not f.name.startswith(".")]
     unread = [f for f in unread if f.suffix.lower() in _SUFFIXES[1:]]
     archives = {f.parent for f in read if f.suffix.lower() == ".npz"}
@@ -249,20 +251,19 @@ def notes_on_unread_files(paths: str | Path | Iterable[str | Path]) -> list[str]
     notes = []
     if beside:
         notes.append(
-            f"not read, since the folder holds recordings as .npz: {_some(beside)}; if they are others, "
-            "move them to another folder"
+            f"not read, since the folder holds recordings as .npz: {first_of(beside, _LISTED)}; if they "
+            "are others, move them to another folder"
         )
     if other:
         notes.append(
-            f"not read, since they do not begin as a recording does: {_some(other)}; named alone, such a "
-            "file tells what is wrong"
+            f"not read, since they do not begin as a recording does: {first_of(other, _LISTED)}; named "
+            "alone, such a file tells what is wrong"
         )
     return notes
 
 
-def _some(files: list[Path]) -> str:
-    more = f" and {len(files) - 2} more" if len(files) > 2 else ""
-    return f"{', '.join(map(str, files[:2]))}{more}"
+def _as_paths(paths: str | Path | Iterable[str | Path]) -> list[Path]:
+    return [Path(paths)] if isinstance(paths, str | Path) else [Path(p) for p in paths]
 
 
 # --- what is a recording --------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import Any, Self
 from torchpose._core.digests import digest_of_files
 from torchpose._core.files import atomic_path, check_output_folder, hold
 from torchpose._core.reading import npz_keys
+from torchpose._core.wording import first_of
 from torchpose.errors import OutputError, TorchposeError
 
 _LISTED = 5
@@ -176,7 +177,7 @@ class ResultsFolder:
         if strangers:
             self.notes.append(
                 "files in the place of results that are not known to be of this command were moved to "
-                f"{aside}: {_some(strangers)}"
+                f"{aside}: {first_of(strangers, _LISTED)}"
             )
 
 
@@ -349,11 +350,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink()
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.frame_rates import group_by_rate
+from torchpose._core.wording import first_of
 from torchpose.camera._projection import project
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
@@ -327,8 +328,7 @@ def _names_by_kind(kinds: Sequence[str | None], names: Sequence[str], found: lis
     each = []
     for kind in found:
         own = [name for name, other in zip(names, kinds, strict=True) if other == kind]
-        more = f" and {len(own) - _SHOWN_NAMES} more" if len(own) > _SHOWN_NAMES else ""
-        each.append(f"{kind}: {', '.join(own[:_SHOWN_NAMES])}{more}")
+        each.append(f"{kind}: {first_of(own, _SHOWN_NAMES)}")
     return "; ".join(each)
 
 

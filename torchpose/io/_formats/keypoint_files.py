@@ -16,6 +16,7 @@ from torchpose._core.reading import (
     read_text,
     texts,
 )
+from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
@@ -101,7 +102,7 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
     if any(column.lower().endswith("z") for column in left_out):
         _check_flat(path, raw.keypoints)
     if left_out:
-        shown = _some(left_out)
+        shown = first_of(left_out, _SHOWN)
         raw.notes = (f"columns {shown} are passed over: x, y and a score of keypoints count",)
     raw.fps, raw.image_size = _csv_notes(path, notes)
     return raw
@@ -163,13 +164,13 @@ def _wide_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
     if names and strange:
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],...; delete or rename "
-            f"{_some(strange)} (a score is NAME_confidence; no time is "
+            f"{first_of(strange, _SHOWN)} (a score is NAME_confidence; no time is "
             "read: write # fps = 30 above the header)"
         )
     if not names or absent or len(column) != len(header):
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],... each once, got "
-            f"{_some(absent or header)}" + " (absent)" * bool(absent)
+            f"{first_of(absent or header, _SHOWN)}" + " (absent)" * bool(absent)
         )
     table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
     table = table.reshape(-1, len(header))
@@ -184,12 +185,6 @@ def _wide_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
             given = column.get(f"{name}_{trust}")
             confidence[index, j] = 1.0 if given is None else table[:, given]
     return RawKeypoints(points, tuple(names), confidence, first_frame=first)
-
-
-def _some(columns: Sequence[str]) -> str:
-    """Return the first columns, and how many more there are."""
-    more = len(columns) - _SHOWN
-    return ", ".join(columns[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _long_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:

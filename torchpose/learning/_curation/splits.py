@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.wording import first_of
 from torchpose.errors import InputError, OverlapError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import label, measured
@@ -148,9 +149,8 @@ def unstated_rates(recordings: Iterable[Recording]) -> list[str]:
     unknown = [label(recording) for recording in recordings if not recording.fps]
     if not unknown:
         return []
-    more = f" and {len(unknown) - 2} more" if len(unknown) > 2 else ""
     return [
-        f"no frame rate is stated by {', '.join(unknown[:2])}{more}; that of most other recordings is "
+        f"no frame rate is stated by {first_of(unknown, 2)}; that of most other recordings is "
         "assumed, without any 30 frames per second: state it (key `fps` in the .npz, a column `time` or "
         "`# fps = 30` above the header of a table)"
     ]

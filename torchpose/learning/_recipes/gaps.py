@@ -7,9 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.wording import first_of
 from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
+from torchpose.math._hermite import hermite
 
 LONGEST_GAP = 0.2
 """Seconds from one whole frame to the next, up to which joints that are missing between are interpolated."""
@@ -26,9 +28,7 @@ def missing_joints(joints: Float[Tensor, "T J 3"]) -> Bool[Tensor, "T J"]:
 def fill_short_gaps(joints: Float[Tensor, "T J 3"], fps: float) -> Float[Tensor, "T J 3"]:
     """Return joints without gaps of up to 0.2 s, which are filled by cubic Hermite pieces.
 
-    Whole frames at the times t_k are the knots, with slopes m_k by differences of second order:
-
-        p(t) = h00 p_k + h10 d m_k + h01 p_(k+1) + h11 d m_(k+1),   d = t_(k+1) - t_k
+    Whole frames are the knots, with slopes by differences of second order.
 
     Args:
         joints: metres, NaN where missing. fps: frames per second.
@@ -46,12 +46,8 @@ def fill_short_gaps(joints: Float[Tensor, "T J 3"], fps: float) -> Float[Tensor,
     points = joints[knots]
     slopes = torch.gradient(points, spacing=(knots.to(points),), dim=0)[0]
     s, d = (((time - first) / d).to(points)[:, None, None], d.to(points)[:, None, None])
-    filled = (
-        (2 * s**3 - 3 * s**2 + 1) * points[after - 1]
-        + (s**3 - 2 * s**2 + s) * d * slopes[after - 1]
-        + (3 * s**2 - 2 * s**3) * points[after]
-        + (s**3 - s**2) * d * slopes[after]
-    )
+    ends, sides = ((values[after - 1], values[after]) for values in (points, slopes))
+    filled = hermite(s, ends, sides, d)
     return torch.where((missing & short[:, None])[..., None], filled, joints)
 
 
@@ -88,12 +84,10 @@ def notes_on_gaps(recordings: Sequence[Recording]) -> tuple[str, ...]:
     counts = [int(missing_joints(_body(r)).any(-1).sum()) for r in recordings]
     if not any(counts):
         return ()
-    first = next(r for r, count in zip(recordings, counts, strict=True) if count)
-    several = sum(count > 0 for count in counts)
-    where = _file_of(first) + (f" and {several - 1} more" if several > 1 else "")
+    files = [_file_of(r) for r, count in zip(recordings, counts, strict=True) if count]
     return (
         f"{sum(counts)} frames with missing joints are interpolated, in gaps of up to {LONGEST_GAP:g} s: "
-        f"{where}",
+        f"{first_of(files, 1)}",
     )
 
 
