@@ -22,13 +22,8 @@ from torchpose.whole_body._keypoints.people_association import (
     owned_detections,
     taken_detections,
 )
-from torchpose.whole_body._keypoints.turn_looks import free_turns, with_odds
-from torchpose.whole_body._keypoints.turned_cameras import (
-    angles_of,
-    find_turns,
-    turned,
-    unlikely,
-)
+from torchpose.whole_body._keypoints.turn_looks import likely_turns, side_by_side
+from torchpose.whole_body._keypoints.turned_cameras import turned, unlikely
 
 _WIDTHS = (25.0, 25.0, 25.0, 9.0, 9.0, 1.0)  # factors of the noise's variance, to group by
 _HEADINGS = 2
@@ -61,7 +56,6 @@ def turns_of_all(
         filter: that tracks. frame: [D, C, J], as they were detected. turn: of cameras, as believed so far.
     """
     maps, known = filter.maps, turn
-    free = free_turns(len(turn), turn.device)
     before: Tensor | None = None
     for width in _WIDTHS:
         groups = _groups(filter, turned(frame, turn, maps), width)
@@ -71,9 +65,7 @@ def turns_of_all(
             continue
         before = groups
         persons = taken_detections(frame, groups)
-        beside = side_by_side(persons)
-        found = find_turns(beside.take(torch.zeros(len(free), dtype=torch.long)), free, maps)
-        cost = with_odds((found.misfit.sum(-1) + found.price)[None], angles_of(found.matrix)[None])
+        found, cost = likely_turns(side_by_side(persons.map(lambda value: value[None])), maps)
         best = int(cost.argmin())
         turn = found.matrix[best]
     if not bool(((groups >= 0).sum(-1) >= LEAST_CAMERAS).any()):
@@ -81,11 +73,6 @@ def turns_of_all(
     gain = _evidence(filter, frame, turn) - float(found.price[best])
     gain -= _evidence(filter, frame, known) - float(unlikely(known))
     return CrowdTurns(found.matrix, best, gain, persons)
-
-
-def side_by_side(frame: KeypointFrame) -> KeypointFrame:
-    """Return the keypoints [P, C, J] of persons as those of one with all their joints, [1, C, P J]."""
-    return frame.map(lambda value: value.transpose(0, 1).flatten(1, 2)[None])
 
 
 def _groups(filter: BodyKalmanFilter, frame: KeypointFrame, width: float) -> Int[Tensor, "G C"]:

@@ -22,7 +22,7 @@ from torch import Tensor
 from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.nested import mapped, replaced, taken
-from torchpose.whole_body._keypoints.turned_cameras import angles_of, find_turns
+from torchpose.whole_body._keypoints.turned_cameras import Turns, angles_of, find_turns
 
 _FRAMES = 16  # that are kept
 # Log-odds of all cameras turned, which one that is turned by more explains nearly as well.
@@ -105,21 +105,14 @@ def _estimated(
     place = looks.n_frames.long()
     frames = mapped(lambda kept, new: _with_frame(kept, new, place), looks.frames, frame)
     used = int(place.amax()) + 1
-    n, n_cameras = frame.inlier.shape[:2]
-    free = free_turns(n_cameras, frame.inlier.device)
-    rows = torch.arange(n, device=place.device)
     share = 1 / (1 + looks.lasting * looks.n_frames)
     counted = frames._replace(inlier=frames.inlier * share[:, None, None, None])
-    side_by_side = counted.map(lambda value: value[:, :used].transpose(1, 2).flatten(2, 3))
-    found = find_turns(
-        side_by_side.take(rows.repeat_interleave(len(free))), free.repeat(n, 1), maps,
-        looks.turn.flatten(0, 1),
-    )  # fmt: skip
+    beside = side_by_side(counted.map(lambda value: value[:, :used]))
+    found, cost = likely_turns(beside, maps, looks.turn.flatten(0, 1))
     turn = found.matrix.view_as(looks.turn)
-    cost = with_odds((found.misfit.sum(-1) + found.price).view(n, -1), angles_of(turn))
-    chosen = rows * len(free) + cost.argmin(-1)
+    chosen = torch.arange(len(cost), device=place.device) * cost.shape[1] + cost.argmin(-1)
     lasting = _lasting(found.errors[chosen], found.weights[chosen], used)
-    poor = (found.misfit[chosen] > _POOR * side_by_side.inlier.sum(-1)).any(-1)
+    poor = (found.misfit[chosen] > _POOR * beside.inlier.sum(-1)).any(-1)
     lasting = lasting.masked_fill(poor, 0.0)
     after = TurnLooks(frames, looks.n_frames + 1, looks.age, turn, lasting)
     return after, _mean_turn(turn, cost, lasting)
@@ -156,7 +149,28 @@ def _mean_turn(
     return torch.where(none[:, None, None, None], turn[:, -1], mean)
 
 
-def with_odds(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Float[Tensor, "B H"]:
+def side_by_side(frames: KeypointFrame) -> KeypointFrame:
+    """Return keypoints [B, K, C, J] of K frames, or persons, as those of one with all joints, [B, C, K J]."""
+    return frames.map(lambda value: value.transpose(1, 2).flatten(2, 3))
+
+
+def likely_turns(
+    frame: KeypointFrame, maps: RigMaps, known: Float[Tensor, "N C 3 3"] | None = None
+) -> tuple[Turns, Float[Tensor, "B H"]]:
+    """Return turns by each of the explanations of `free_turns`, and what these cost with their prior odds.
+
+    Args:
+        frame: the keypoints [B, C, J]. maps: the cameras. known: turns that are near; N = B H.
+    """
+    n, n_cameras = frame.inlier.shape[:2]
+    free = free_turns(n_cameras, frame.inlier.device)
+    rows = torch.arange(n, device=free.device).repeat_interleave(len(free))
+    found = find_turns(frame.take(rows), free.repeat(n, 1), maps, known)
+    cost, angles = found.misfit.sum(-1) + found.price, angles_of(found.matrix)
+    return found, _with_odds(cost.view(n, -1), angles.view(n, -1, n_cameras))
+
+
+def _with_odds(cost: Float[Tensor, "B H"], angles: Float[Tensor, "B H C"]) -> Float[Tensor, "B H"]:
     """Return what explanations cost with the prior odds of one camera and of all.
 
     Args:
