@@ -15,6 +15,7 @@ and its corrections are about that. From the calibration as given the turn would
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -121,29 +122,36 @@ def _refined(
 ) -> RefinedCameras:
     """Return cameras without errors about those of a rig."""
     before = track(rig, frames, True)
-    found = _refined_from(before, rig, frames, track, fps, what, exchange, smoothing)
+    start = CameraErrors.none(rig)
+    if bool(free_errors(len(rig), what)[:, DELAY].any()):
+        start.values[:, DELAY] = whole_delays(rig, frames, fps).to(start.values)
+    refine = partial(_refined_from, start, before, rig, frames, track, fps, exchange, smoothing)
+    found = refine(what)
     if what == "both":
-        late = _refined_from(before, rig, frames, track, fps, "delays", exchange, smoothing)
+        late = refine("delays")
         if found.gain < late.gain + _LEAST_GAIN:
             return late
     return found
 
 
 def _refined_from(
+    errors: CameraErrors,
     before: KeypointPoses,
     rig: CameraRig,
     frames: KeypointFrame,
     track: Track,
     fps: float,
-    what: str,
     exchange: Exchange,
     smoothing: bool,
+    what: str,
 ) -> RefinedCameras:
-    """Return cameras without some kinds of errors about those of a rig, with which the body was tracked."""
-    errors, free = CameraErrors.none(rig), free_errors(len(rig), what)
+    """Return cameras without some kinds of errors about those of a rig, with which the body was tracked.
+
+    Args:
+        errors: to begin with. before: poses by the cameras as they are. The others are those of `_refined`.
+    """
+    free = free_errors(len(rig), what)
     poses, adjusted = before, None
-    if bool(free[:, DELAY].any()):
-        errors.values[:, DELAY] = whole_delays(rig, frames, fps).to(errors.values)
     for i in range(_ROUNDS):
         if i > 0 or bool(errors.values.any()):
             known = poses.joints[0] if i > 0 else None
