@@ -9,7 +9,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_start import start
 
 _FRAMES = 8  # at most, in which a body begins by each reading
-_AT_A_TIME = 3  # of these, which bounds the memory
+_AT_A_TIME = 4  # frames: this bounds the memory, and half of all may be enough
 _LEAST_JOINTS = 10  # that two cameras see, of a frame that tells
 _LEAST_GAIN = 20.0  # log-evidence of exchanged sides, of all frames together
 
@@ -20,8 +20,13 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
     Args:
         filter: of two cameras or more. frames: keypoints [T, C, J].
     """
-    gains = evidence_of_exchanged(filter, frames)
-    if float(gains.sum()) < _LEAST_GAIN or float(gains.median()) <= 0:
+    told = _telling(frames)
+    gains = torch.zeros(0)
+    for part in zip(*(value.split(_AT_A_TIME) for value in told), strict=True):
+        gains = torch.cat([gains, _gains(filter, KeypointFrame(*part)).cpu()])
+        if 2 * int((gains <= 0).sum()) >= len(told.inlier):  # the median is not above 0
+            return ()
+    if float(gains.sum()) < _LEAST_GAIN:
         return ()
     return (
         "left and right seem to be exchanged in all cameras: with the other sides bodies are likelier "
@@ -30,17 +35,14 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
     )
 
 
-def evidence_of_exchanged(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:
-    """Return by how much log-evidence grows if sides are exchanged, of bodies that begin in some frames."""
+def _telling(frames: KeypointFrame) -> KeypointFrame:
+    """Return frames [N, C, J], of those in which two cameras see most joints."""
     told = ((frames.inlier > 0).sum(1) >= 2).sum(-1) >= _LEAST_JOINTS
     rows = told.nonzero().squeeze(-1)
-    rows = rows[:: max(1, -(-len(rows) // _FRAMES))]
-    some = frames.take(rows)
-    other = some.map(lambda value: value.index_select(2, filter.exchange.mirror))
-    return _evidence(filter, other) - _evidence(filter, some)
+    return frames.take(rows[:: max(1, -(-len(rows) // _FRAMES))])
 
 
-def _evidence(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:
-    """Return the log-evidence of bodies that begin in each of the frames."""
-    parts = zip(*(value.split(_AT_A_TIME) for value in frames), strict=True)
-    return torch.cat([start(filter, KeypointFrame(*part)).log_evidence for part in parts])
+def _gains(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:
+    """Return by how much log-evidence grows if sides are exchanged, of bodies that begin in each frame."""
+    other = frames.map(lambda value: value.index_select(2, filter.exchange.mirror))
+    return start(filter, other).log_evidence - start(filter, frames).log_evidence
