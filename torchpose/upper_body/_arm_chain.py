@@ -198,7 +198,7 @@ class ArmChain:
                 lower.ends, borders[..., :-1, :], borders[..., -1, :], log_inside[..., None, None]
             )
         if elbow and hand:
-            places = torch.cat([upper.ends, lower.ends.flatten(-3, -2)], -2)
+            places = torch.cat([start, lower.ends.flatten(-3, -2)], -2)
             in_view = log_in_view(places, shoulder, meant(arm.middle))
             of_elbow, of_hand = in_view.tensor_split(sizes[:1], -1)
             weight = weight + of_elbow[..., None] + of_hand.view(weight.shape)

@@ -21,26 +21,18 @@ class LimbNodes(NamedTuple):
 
     Attributes:
         start: the near end of the limb, [..., 3]. length: its length, [...].
-        axes, turns: e and t of the unit vectors sum_a t_a e_a from there to the far end, [..., A, 3] and
-            [G, A].
+        directions: unit vectors from there to the far end, sum_a t_a e_a, [..., G, 3].
+        axes, turns: e and t, [..., A, 3] and [G, A].
         log_weight: the log of the likelihood of the pixel times the node's share of the sphere of
             directions, [..., G]. A sum over nodes, times a density over directions, is its integral.
     """
 
     start: Tensor
     length: Tensor
+    directions: Tensor
     axes: Tensor
     turns: Tensor
     log_weight: Tensor
-
-    @property
-    def directions(self) -> Float[Tensor, "*batch G 3"]:
-        """Return the unit vectors from the near end to the far end."""
-        turns, (first, *others) = self.turns[..., None], self.axes[..., None, :].unbind(-3)
-        total = turns[:, 0] * first
-        for axis, turn in zip(others, turns.unbind(1)[1:], strict=True):
-            total = torch.addcmul(total, axis, turn)
-        return total
 
     @property
     def ends(self) -> Float[Tensor, "*batch G 3"]:
@@ -80,7 +72,7 @@ def nodes_on_ray(
     constant = step - 0.5 * math.log(2 * math.pi) - (std * length).log()
     log_weight = constant[..., None].sub(off.square(), alpha=0.5)
     axes = torch.stack([along.expand_as(across), across / rho.clamp_min(1e-6)], -2)
-    return LimbNodes(start, length, axes, turns, log_weight)
+    return LimbNodes(start, length, _turned(axes, turns), axes, turns, log_weight)
 
 
 def nodes_anywhere(
@@ -96,8 +88,21 @@ def nodes_anywhere(
             which the points of the sphere are. n_nodes: G.
     """
     weight = start.new_full((), math.log(4 * math.pi / n_nodes))
+    weight = weight.expand(*start.shape[:-1], n_nodes)
     points = _kept_sphere(n_nodes, start.dtype, start.device)
-    return LimbNodes(start, length, axes, points, weight.expand(*start.shape[:-1], n_nodes))
+    return LimbNodes(start, length, _turned(axes, points), axes, points, weight)
+
+
+def _turned(
+    axes: Float[Tensor, "*batch A 3"], turns: Float[Tensor, "G A"]
+) -> Float[Tensor, "*batch G 3"]:
+    """Return sum_a t_a e_a."""
+    first, *others = axes[..., None, :].unbind(-3)
+    turn, *more = turns[..., None].unbind(1)
+    total = turn * first
+    for axis, turn in zip(others, more, strict=True):
+        total = torch.addcmul(total, axis, turn)
+    return total
 
 
 @cache
