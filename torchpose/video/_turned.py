@@ -5,7 +5,7 @@ from itertools import islice
 import numpy as np
 
 from torchpose._core.images import Image
-from torchpose.measure._face_detector import HaarFaceDetector
+from torchpose.measure._face_detector import HaarFaceDetector, resized
 from torchpose.video._source_interface import VideoSource
 
 _FRAMES, _APART = 6, 50  # that are looked at, and frames from one to the next
@@ -44,6 +44,4 @@ def _small_grey(image: Image) -> Image:
     import cv2
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, _SIDE / max(grey.shape))
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
+    return resized(np.asarray(grey, np.uint8), min(1.0, _SIDE / max(grey.shape)))
