@@ -7,7 +7,7 @@ with open_video("clip.mp4") as video:  # open_video(0) is the first camera
     tracker = torchpose.VideoTracker(prior, camera, fps=video.fps, max_persons=1)
     state = tracker.init()
     for frame in video:  # with image, time and index
-        state, people = tracker.step(state, frame.image)
+        state, people = tracker.step(state, frame)
 
 for number, pose, measured in people:
     print(number, pose.joints3d.shape, measured.keypoints.shape)

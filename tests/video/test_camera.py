@@ -116,20 +116,51 @@ def test_of_a_faster_camera_frames_are_left_out(camera):
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_reader_that_is_too_slow_is_told(camera, closed):
+def test_frames_that_a_slow_reader_misses_are_counted(camera, closed):
     source, fake = camera(WARM_UP + 31)
-    for frame in source:
+    for count, frame in enumerate(source):
+        assert (frame.index, frame.missed) == (4 * count, 3 if count else 0)
+        assert frame.time == pytest.approx(frame.index / 30)
         fake.now += 0.1  # at which the camera's further frames are lost
-        if closed and frame.index == 29:
+        if closed and count == 29:
             source.close()
             break
-    assert source.notes[0].startswith(
-        "camera 3 was read at 7.5 frames per second, and 30 were assumed"
-    )
-    assert "4 times as fast as the person" in source.notes[0] and "--fps 7.1" in source.notes[0]
+    assert source.notes[0].startswith("camera 3 was read at 7.5 of 30 frames per second")
+    assert "--fps 7.1" in source.notes[0]
     assert len(source.notes) == 2 - closed
+
+
+def test_who_keeps_up_misses_nothing(camera):
     source, _ = camera(WARM_UP + 90)
-    assert len(list(source)) == 90 and len(source.notes) == 1
+    assert not any(frame.missed for frame in source)
+    assert len(source.notes) == 1  # that it ended
+
+
+def test_a_pause_is_no_time_in_which_frames_were_missed(camera):
+    source, fake = camera(WARM_UP + 20)
+    frames = []
+    for frame in source:
+        frames.append(frame)
+        fake.now += 60.0 if len(frames) == 10 else 0.0
+    assert [frame.index for frame in frames] == list(range(20))
+    assert frames[-1].time > 60 and not any(frame.missed for frame in frames)
+
+
+def test_delays_of_single_frames_are_no_missed_ones(camera):
+    source, fake = camera(WARM_UP + 60)
+    late = 0.6 / 30
+    for count, frame in enumerate(source):
+        assert (frame.index, frame.missed) == (count, 0)
+        fake.now += late if count % 2 else -late
+
+
+@pytest.mark.parametrize(("pace", "frames"), [(27.0, 100), (33.0, 82)])
+def test_a_camera_at_a_rate_of_its_own_keeps_the_time(camera, pace, frames):
+    source, _ = camera(WARM_UP + 90, pace=pace)
+    assert source.fps == 30
+    *_, last = source
+    assert last.index + 1 == pytest.approx(frames, abs=2)
+    assert last.index / 30 == pytest.approx(last.time, abs=1 / 30)
 
 
 def test_not_there_in_use_or_silent(camera):

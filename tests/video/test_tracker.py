@@ -13,6 +13,7 @@ from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body._keypoint_files import TrackSettings
+from torchpose.video._camera import CameraFrame
 
 pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
 FACE = 3  # the head, in `UPPER_BODY`
@@ -74,6 +75,48 @@ def test_bones_alone_track_unless_the_prior_knows_others():
         info = replace(shipped.info, persons=persons)
         own = UpperBodyPrior(shipped.left, shipped.right, info, windows=shipped.windows)
         assert VideoTracker(own, demo_camera()).tracker.method == "multiple-model"
+
+
+@pytest.fixture
+def with_gaps(one_person):
+    """Frames 0 to 29, and every third one of the others, as of a camera whose reader became slow."""
+    numbers = [*range(30), *range(32, 60, 3)]
+    before = [-1, *numbers[:-1]]
+    frames = [CameraFrame(one_person[at], at / 30, at) for at in numbers]
+    for frame, last in zip(frames, before, strict=True):
+        frame.missed = frame.index - last - 1
+    return frames
+
+
+def test_missed_frames_take_their_time(prior, one_person, with_gaps):
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
+    shown = []
+    (person,) = tracker(with_gaps, watch=lambda image, found, poses: shown.append((image, poses)))
+    assert len(shown) == 60 and shown[30][0] is shown[32][0] is one_person[32]
+    assert person.first_frame + len(person) == 60
+    missed = torch.tensor([at >= 30 and at % 3 != 2 for at in range(person.first_frame, 60)])
+    seen = person.keypoints.isfinite().flatten(1).any(1)
+    assert not bool(seen[missed].any()) and bool(seen[~missed][5:].all())
+    track = person.track
+    assert bool(track.joints3d.isfinite().all()) and not bool(track.observed[0, missed].any())
+    own = tracker.tracker(
+        person.keypoints[None], None, tracker.measurer.names, covariance=person.covariance[None],
+        absent=person.absent[None],
+    )  # fmt: skip
+    torch.testing.assert_close(track.joints3d, own.joints3d, rtol=0, atol=1e-9)
+
+
+def test_a_step_of_a_frame_before_which_some_were_missed(prior, with_gaps):
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
+    state = tracker.init()
+    for frame in with_gaps:
+        state, people = tracker.step(state, frame)
+    _, parts = tracker.advance(tracker.init(), with_gaps)
+    ((number, pose, measured),) = people
+    whole = parts[number][-1].poses
+    assert pose.joints3d.shape == (1, 1, 8, 3) and len(measured.seen) == 1
+    assert pose.lengths.tolist() == [1] and pose.failed_at.tolist() == [-1]
+    torch.testing.assert_close(pose.joints3d, whole.joints3d[:, -1:], rtol=0, atol=1e-9)
 
 
 def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person):

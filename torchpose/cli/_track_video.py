@@ -62,9 +62,10 @@ def track_video(
             results = stack.enter_context(track_results(job.out, job.files, pictures, overlay))
             start = time.perf_counter()
             if source.reopenable:
-                people, n_frames = _track_recording(tracker, source, results.stage)
+                people, n_read = _track_recording(tracker, source, results.stage)
+                n_frames = n_read
             else:
-                people, n_frames = _track_camera(tracker, source, results.stage, overlay)
+                people, n_read, n_frames = _track_camera(tracker, source, results.stage, overlay)
             seconds = time.perf_counter() - start
         notes += tuple(source.notes)  # some of them are known once it is closed
         if source.reopenable and options["detector"] is None:
@@ -78,7 +79,7 @@ def track_video(
             "camera": camera_text(camera),
             "method": people[0].track.method
             + f"{smoothing_text(settings.smoothing)}, {_measured_by(options)}",
-            "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
+            "speed": f"{n_read / max(seconds, 1e-9):.0f} frames a second, without drawing",
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         names = _names(people, source.reopenable)
@@ -185,8 +186,11 @@ def _track_recording(
 
 def _track_camera(
     tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
-) -> tuple[list["TrackedPerson"], int]:
-    """Return everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
+) -> tuple[list["TrackedPerson"], int, int]:
+    """Return everybody before a camera, and the numbers of frames read and in all.
+
+    A page shows them while it runs, until q, stop or Ctrl-C.
+    """
     from torchpose.video._live_view import LiveView
     from torchpose.video._writer import VideoWriter
 
@@ -198,15 +202,20 @@ def _track_camera(
             writer = VideoWriter(out / _OVERLAY, source.fps, source.size)
             writers.append(stack.enter_context(writer))
 
+        n_frames, shown, drawn = 0, None, None
+
         def watch(image: Any, measured: Any, poses: dict[int, Any]) -> None:
-            drawn = _drawn(image, poses, 0, measured)
-            view.show(drawn)
+            nonlocal n_frames, shown, drawn
+            n_frames += 1
+            if image is not shown:  # the frames missed before it have the same one
+                shown, drawn = image, _drawn(image, poses, -1, measured)
+                view.show(drawn)
             if writers:
                 _record(writers, drawn)
 
         frames = stack.enter_context(UntilInterrupted(source, lambda: view.stop_requested))
         people = tracker(frames, progress=show_progress(), folder=out, watch=watch)
-    return people, frames.count
+    return people, frames.count, n_frames
 
 
 def _record(writers: list[Any], image: Any) -> None:

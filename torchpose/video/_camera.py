@@ -1,9 +1,7 @@
 """Read cameras by OpenCV."""
 
-import math
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
 from torchpose._core.checks import check_rate
@@ -14,8 +12,8 @@ _WARM_UP = 10  # frames that are discarded: exposure settles, and the rate is me
 _PATIENCE = 5  # reads without a frame, one after another, before a camera counts as unplugged
 _PAUSE = 0.02  # seconds between them
 _WRONG = 0.05  # share by which two rates may differ
-_PAUSES = 10.0  # times the usual time between frames, which is then a pause
-_REMEMBERED = 10_000  # frames, so that a camera may run for days
+_EARLY = 0.75  # of the time between frames by which one may come before its time, so that delays do not count
+_PAUSE_FROM = 1.0  # seconds without a frame, which are then a pause: no frames were missed in it
 _TELLING = 2.0  # seconds of frames that tell at what rate they are read
 
 
@@ -34,12 +32,18 @@ class Capture(Protocol):
     def release(self) -> None: ...
 
 
+class CameraFrame(VideoFrame):
+    """Holds one frame of a camera."""
+
+    missed = 0
+
+
 class CameraSource(VideoSource):
     """Yields frames of a camera until it is closed or unplugged.
 
     The rate is measured over the first frames, which are discarded while the exposure settles. The times
-    of the frames are those of the clock. Only the newest frame waits, so that a slow reader misses some:
-    once the source is closed, a note says at what rate frames were read if that was another one.
+    of the frames are those of the clock. Only the newest frame waits, so that a slow reader misses some.
+    They are counted by the clock (`VideoFrame.missed`), and a note tells of them once the source is closed.
 
     Args:
         index: number of the camera, from 0.
@@ -57,7 +61,7 @@ class CameraSource(VideoSource):
         capture: Callable[[int], Capture] | None = None,
     ) -> None:
         super().__init__(f"camera {index}")
-        self._early = math.inf  # seconds by which a frame may come before its time
+        self._early = _EARLY  # of the time between frames by which one may come before its time
         if index < 0:
             raise InputError(f"the number of a camera is 0 or more, got {index}")
         if fps is not None:
@@ -101,7 +105,7 @@ class CameraSource(VideoSource):
             self.notes.append(
                 f"the camera gives {self.fps:.4g} frames per second; {fps:.4g} of them are used, as asked for"
             )
-            self.fps, self._early = fps, 0.5 / self.fps
+            self.fps, self._early = fps, 0.5 * fps / self.fps
 
     def _grab(self) -> Any:
         for attempt in range(_PATIENCE):
@@ -115,22 +119,24 @@ class CameraSource(VideoSource):
     def _read(self) -> Iterator[VideoFrame]:
         import cv2
 
-        times: deque[float] = deque(maxlen=_REMEMBERED)
-        count = 0
-        due = 0.0  # seconds
+        index, due, n_read = -1, 0.0, 0  # the next frame is due after this many seconds
         try:
             for image, seconds in self._images():
-                if seconds < due - self._early:
+                late = (seconds - due) * self.fps  # in frames
+                if late < -self._early:
                     continue
-                # after a pause frames are due from then on, and none is made up for
-                due = max(due, seconds - 1 / self.fps) + 1 / self.fps
-                times.append(seconds)
-                count += 1
-                yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, count - 1)
+                missed = round(late) if late > _EARLY else 0
+                if missed > _PAUSE_FROM * self.fps:
+                    missed, due = 0, seconds
+                due += (1 + missed) / self.fps
+                index, n_read = index + 1 + missed, n_read + 1
+                frame = CameraFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, index)
+                frame.missed = missed
+                yield frame
         finally:  # also if it is closed
-            self._note_rate(times)
+            self._note_rate(n_read, index + 1)
         self.notes.append(
-            f"{self.name} gave no more frames after {count}: unplugged, or used by another program"
+            f"{self.name} gave no more frames after {n_read}: unplugged, or used by another program"
         )
 
     def _images(self) -> Iterator[tuple[Any, float]]:
@@ -146,22 +152,17 @@ class CameraSource(VideoSource):
                 )
             yield image, now - start
 
-    def _note_rate(self, times: Sequence[float]) -> None:
-        """Add a note if the last frames were read at another rate than was assumed, pauses apart."""
-        if not times or times[-1] < _TELLING:
+    def _note_rate(self, n_read: int, n_frames: int) -> None:
+        """Add a note if frames were missed."""
+        if n_frames < _TELLING * self.fps or n_read > (1 - _WRONG) * n_frames:
             return
-        import numpy as np
-
-        gaps = np.diff(times)
-        usual = gaps[gaps <= _PAUSES * np.median(gaps)]
-        rate = len(usual) / usual.sum()
-        if abs(rate / self.fps - 1) > _WRONG:
-            reached = f"{(1 - _WRONG) * rate:.3g}"
-            self.notes.append(
-                f"{self.name} was read at {rate:.3g} frames per second, and {self.fps:.4g} were assumed: "
-                f"poses and overlay move {self.fps / rate:.2g} times as fast as the person; ask for a rate "
-                f"that is reached (fps={reached}, --fps {reached})"
-            )
+        rate = self.fps * (n_read - 1) / (n_frames - 1)
+        reached = f"{(1 - _WRONG) * rate:.3g}"
+        self.notes.append(
+            f"{self.name} was read at {rate:.3g} of {self.fps:.4g} frames per second: nothing was measured "
+            "in the others, whose poses are predicted; ask for a rate that is reached "
+            f"(fps={reached}, --fps {reached})"
+        )
 
     def _release(self) -> None:
         self._capture.release()

@@ -5,9 +5,12 @@ another thread. `step` measures the persons, and may use the hands of the last p
 """
 
 from collections.abc import Generator, Iterable, Iterator, Mapping
+from itertools import repeat
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchpose._core.images import Image
 from torchpose._core.inference import usable_anywhere
@@ -22,23 +25,36 @@ from torchpose.measure._upper_body_measurer import (
     UpperBodyMeasurer,
 )
 
-Found = FrameMeasurements | FrameKeypoints
+
+class MissedFrame(NamedTuple):
+    """Holds the measurements in a frame that a camera gave and nobody read: those of no person."""
+
+    person: Int[Tensor, " 0"] = torch.zeros(0, dtype=torch.long)
+    faces: None = None
+
+
+Found = FrameMeasurements | FrameKeypoints | MissedFrame
 """The measurements of all persons in a frame."""
 
 
 class SeenFrame(NamedTuple):
-    """Holds a frame, and what its image shows of persons; None with a detector of keypoints."""
+    """Holds a frame, what its image shows of persons, and the number of frames missed before it.
+
+    Attributes:
+        image: RGB. view: None with a detector of keypoints. missed: the number of frames.
+    """
 
     image: Image
     view: PersonsView | None
+    missed: int = 0
 
 
 class MeasuredBlock(NamedTuple):
     """Holds the measurements in some frames, and the state of the measurer after the last.
 
     Attributes:
-        images: the frames, if anything uses them; else none. found: the measurements in each.
-        state: after the last.
+        images: the frames, if anything uses them; else none. Missed frames have the image of the next one.
+        found: the measurements in each. state: after the last.
     """
 
     images: list[Image]
@@ -171,13 +187,20 @@ def _check_state(state: Any, kind: type) -> None:
         )
 
 
-def look_ahead(measurer: Measurer, state: Any, images: Iterable[Image]) -> Iterator[SeenFrame]:
-    """Yield frames with what they show, which later frames and poses do not change."""
+def look_ahead(
+    measurer: Measurer, state: Any, images: Iterable[tuple[Image, int]]
+) -> Iterator[SeenFrame]:
+    """Yield frames with what they show, which later frames and poses do not change.
+
+    Args:
+        measurer: sees them. state: its state before the frames.
+        images: each with the number of frames missed before it.
+    """
     seen = measurer.seen(state)
-    for image in images:
+    for image, missed in images:
         frame = measurer.look(seen, image)
         seen = None if frame.view is None else frame.view.after
-        yield frame
+        yield frame._replace(missed=missed)
 
 
 def measure_blocks(
@@ -187,17 +210,22 @@ def measure_blocks(
 
     Args:
         measurer: measures the persons. state: its state before the frames. frames: from `look_ahead`.
-        size: the number of frames of a block; the last one may be shorter.
+        size: the least number of frames of a block; the last one may be shorter.
         keep: whether blocks hold their images.
     """
     images: list[Image] = []
     found: list[Found] = []
     for frame in frames:
         state, one = measurer.step(state, frame)
-        images += [frame.image] if keep else []
-        found.append(one)
-        if len(found) == size:
+        images += [frame.image] * (1 + frame.missed) if keep else []
+        found += after_missed(frame, one)
+        if len(found) >= size:
             yield MeasuredBlock(images, found, state)
             images, found = [], []
     if found:
         yield MeasuredBlock(images, found, state)
+
+
+def after_missed(frame: SeenFrame, found: Found) -> list[Found]:
+    """Return the measurements of the frames missed before a frame, and of the frame itself."""
+    return [*repeat(MissedFrame(), frame.missed), found]

@@ -14,10 +14,10 @@ from torchpose._core.inference import usable_anywhere
 from torchpose.errors import InputError
 from torchpose.measure._association import AssociationState, HandAssociation
 from torchpose.measure._keypoint_measurer import FrameKeypoints
-from torchpose.measure._upper_body_measurer import FrameMeasurements
 from torchpose.upper_body._live_pose import StreamState
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
+from torchpose.video._measurers import Found, MissedFrame
 
 
 class Measured(NamedTuple):
@@ -48,13 +48,13 @@ class Measured(NamedTuple):
         return Measured(*(None if x is None else x[rows] for x in self))  # type: ignore[arg-type]
 
 
-def measured_of(
-    block: Sequence[FrameMeasurements | FrameKeypoints], number: int, n_joints: int
-) -> Measured:
-    """Return the measurements of one person in each frame of a block, all of one kind."""
+def measured_of(block: Sequence[Found], number: int, n_joints: int) -> Measured:
+    """Return the measurements of one person in each frame of a block, all of one kind or missed."""
     detected = any(isinstance(frame, FrameKeypoints) for frame in block)
     found = unmeasured(len(block), n_joints, detected)
     for t, frame in enumerate(block):
+        if isinstance(frame, MissedFrame):
+            continue
         for row in torch.nonzero(frame.person == number).flatten()[:1]:
             found.keypoints[t], found.absent[t] = frame.keypoints[row], frame.absent[row]
             if isinstance(frame, FrameKeypoints):
@@ -111,6 +111,14 @@ class TrackedBlock(NamedTuple):
     start: int
     poses: PoseTrack
     measured: Measured
+
+    def last(self) -> "TrackedBlock":
+        """Return the last frame alone."""
+        before = len(self.measured.seen) - 1
+        if not before:
+            return self
+        poses = _frames(self.poses, slice(before, None))
+        return TrackedBlock(self.start + before, poses, self.measured.frames(slice(before, None)))
 
 
 class PersonStream(nn.Module):
@@ -205,7 +213,7 @@ class PersonStream(nn.Module):
     def advance_all(
         self,
         states: Mapping[int, PersonStreamState],
-        block: Sequence[FrameMeasurements | FrameKeypoints],
+        block: Sequence[Found],
         images: Sequence[Image],
         gap: int,
     ) -> tuple[dict[int, PersonStreamState], dict[int, list[TrackedBlock]]]:
@@ -256,7 +264,7 @@ class PersonStream(nn.Module):
             gone = torch.nonzero(_frames_unseen(poses, before) > gap).flatten()
             if len(gone):
                 end = int(gone[0]) + 1
-                state, poses, chosen = None, _first_frames(poses, end), chosen.frames(slice(end))
+                state, poses, chosen = None, _frames(poses, slice(end)), chosen.frames(slice(end))
                 if not measured.seen[start + end - 1]:
                     poses = _without_poses(poses, torch.arange(end) == end - 1)
             parts.append(TrackedBlock(start, poses, chosen))
@@ -337,11 +345,14 @@ def _frames_unseen(poses: PoseTrack, unseen: int) -> Int[Tensor, " T"]:
     return _frames_since(poses.observed[0].any(-1), unseen)
 
 
-def _first_frames(poses: PoseTrack, count: int) -> PoseTrack:
-    """Return the first frames of one sequence."""
-    cut = {name: getattr(poses, name)[:, :count] for name in FRAME_FIELDS}
-    failed_at = torch.where(poses.failed_at < count, poses.failed_at, -1)
-    return replace(poses, **cut, lengths=poses.lengths.clamp(max=count), failed_at=failed_at)
+def _frames(poses: PoseTrack, rows: slice) -> PoseTrack:
+    """Return some frames, one after the other, of one sequence."""
+    cut = {name: getattr(poses, name)[:, rows] for name in FRAME_FIELDS}
+    start, stop, _ = rows.indices(poses.joints3d.shape[1])
+    failed_at = (poses.failed_at - start).clamp(min=0)
+    failed_at = torch.where((poses.failed_at >= 0) & (poses.failed_at < stop), failed_at, -1)
+    lengths = (poses.lengths.clamp(max=stop) - start).clamp(min=0)
+    return replace(poses, **cut, lengths=lengths, failed_at=failed_at)
 
 
 def _without_poses(poses: PoseTrack, away: Bool[Tensor, " T"]) -> PoseTrack:

@@ -14,12 +14,17 @@ class VideoFrame(NamedTuple):
     Attributes:
         image: RGB, uint8, [H, W, 3], C-contiguous; the receiver may draw on it.
         time: seconds since the first frame. Files and folders: index / fps, exactly. Cameras: clock.
-        index: 0, 1, 2, ...
+        index: 0, 1, 2, ...; of a camera, missed frames are counted.
     """
 
     image: Image
     time: float
     index: int  # type: ignore[assignment]  # a tuple has a method of that name
+
+    @property
+    def missed(self) -> int:
+        """Return the number of frames that a camera gave right before, and that nobody read."""
+        return 0
 
 
 class VideoSource(abc.ABC):

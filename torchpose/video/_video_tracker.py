@@ -45,6 +45,7 @@ from torchpose.video._measurers import (
     MeasuredBlock,
     Measurer,
     SeenFrame,
+    after_missed,
     look_ahead,
     measure_blocks,
     measurer_of,
@@ -57,6 +58,7 @@ from torchpose.video._person_stream import (
 )
 from torchpose.video._prefetch import prefetch
 from torchpose.video._recording import TrackedPerson, TrackedRecording
+from torchpose.video._source_interface import VideoFrame
 
 Watcher = Callable[[Image, Found, dict[int, PoseTrack]], None]
 """Is called with a frame, its measurements, and the poses of the persons in it by number."""
@@ -111,8 +113,9 @@ class VideoTracker(nn.Module):
     Args:
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
         camera: the camera that took the video. Frames must have its image size, if it has one.
-        fps: the number of frames per second. All frames are taken to be equally far apart. A video that
-            knows its rate must have this one.
+        fps: the number of frames per second. All frames are taken to be equally far apart; those of a
+            camera that nobody read are counted (`VideoFrame.missed`). A video that knows its rate must have
+            this one.
         hands: the hand tracker: "learnt" (default), "grid" (without its network) or "mean-shift", the
             paper's method.
         background: detect the foreground, for a static camera.
@@ -234,12 +237,15 @@ class VideoTracker(nn.Module):
         return VideoState(self.measurer.init(), {}, {})
 
     @uncompiled
-    def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
+    def step(
+        self, state: VideoState, image: Image | Tensor | VideoFrame
+    ) -> tuple[VideoState, list[LivePerson]]:
         """Return the next state and the persons in one more frame of a camera.
 
         Args:
             state: the state from `init` or the step before. image: the frame, RGB, uint8, an array
-                [H, W, 3] or a tensor [3, H, W].
+                [H, W, 3] or a tensor [3, H, W]; or a `VideoFrame` of a camera, which counts the frames that
+                were missed before it. They take the time of frames in which nothing was measured.
 
         Returns:
             The next state, and the persons seen within the last `max_gap`.
@@ -248,7 +254,7 @@ class VideoTracker(nn.Module):
             InputError: an image of another kind or another size than the camera's, or a tracker that smooths.
         """
         state, tracked = self.advance(state, [image])
-        last = {number: tracked[number][-1] for number in state.streams}
+        last = {number: tracked[number][-1].last() for number in state.streams}
         return state, [LivePerson(n, part.poses, part.measured) for n, part in last.items()]
 
     @uncompiled
@@ -296,7 +302,8 @@ class VideoTracker(nn.Module):
                 tensor [T, 3, H, W].
             progress: whether to show a bar. n_frames: the number of frames, for the bar.
             folder: for temporary files, some 1.2 kB for every pose.
-            watch: is called for every frame; frames are then filtered one by one, which is slower.
+            watch: is called for every frame; frames are then filtered one by one, which is slower. A frame
+                that a camera gave and nobody read is shown by the next one.
 
         Returns:
             The persons who were seen for half a second or longer, the longest seen first.
@@ -318,11 +325,12 @@ class VideoTracker(nn.Module):
                 recording.append(tracked, len(block.found))
                 bar.update(len(block.found))
                 if watch is not None:
-                    watch(block.images[-1], block.found[-1], dict(state.poses))
+                    for _ in block.found:
+                        watch(block.images[-1], block.found[-1], dict(state.poses))
         return recording.finish(self.smoother)
 
-    def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[Image]:
-        """Return the images of frames, which may have more to them, once their rate is known to be `fps`."""
+    def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[tuple[Image, int]]:
+        """Return images, and how many frames were missed before each, once their rate is known."""
         rate = getattr(frames, "fps", None) if getattr(frames, "knows_rate", True) else None
         if rate and abs(rate / self.fps - 1) > _SAME_RATE:
             raise InputError(
@@ -344,14 +352,15 @@ class VideoTracker(nn.Module):
 
         Args:
             state: the state before the frames. seen: the frames with what they show.
-            size: the number of frames of a block; the last one may be shorter.
+            size: the least number of frames of a block; the last one may be shorter.
             ahead: whether frames are measured in another thread while the block before is filtered.
         """
         measurer = self._measurer
         if self.candidates:
             for frame in seen:
                 own, found = measurer.step(state.measurer, frame, _candidates(state.poses))
-                block = MeasuredBlock([frame.image], [found], own)
+                count = 1 + frame.missed
+                block = MeasuredBlock([frame.image] * count, after_missed(frame, found), own)
                 state, tracked = self._follow(state, block)
                 yield state, block, tracked
             return
@@ -423,8 +432,8 @@ def as_image(image: Any) -> Image:
 
 def _images_of_size(
     frames: Iterable[Any] | Tensor, size: tuple[int, int] | None
-) -> Iterator[Image]:
-    """Yield the images of frames, each of the camera's size (width, height) if that is known."""
+) -> Iterator[tuple[Image, int]]:
+    """Yield the images of frames, of the camera's size (width, height) if known, with the numbers missed."""
     for frame in frames:
         image = as_image(getattr(frame, "image", frame))
         own = image.shape[1::-1]
@@ -433,7 +442,7 @@ def _images_of_size(
                 f"a frame is of {own[0]} x {own[1]} pixels, and the camera is for images of "
                 f"{size[0]} x {size[1]}; give the camera of the frames"
             )
-        yield image
+        yield image, getattr(frame, "missed", 0)
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
