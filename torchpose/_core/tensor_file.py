@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -270,6 +270,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, dict)
     if origin is Any:
         return True
+    if origin is Literal:  # which of the values it is, the dataclass checks
+        return isinstance(value, type(parts[0]))
     if origin is float:
         whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < _LARGEST
         return whole or isinstance(value, float)

@@ -29,7 +29,14 @@ from torchpose.filters._frame_noise import (
 )
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
+from torchpose.filters._outputs import (
+    FilterOutput,
+    Mending,
+    StepOutput,
+    finish_output,
+    first_step,
+    mending,
+)
 from torchpose.filters._recompute import recomputed, wants_gradient
 from torchpose.filters._side_by_side import SideBySide, stacked
 from torchpose.filters._weights import WeightRule, between, frame_weights, mixed, normalise
@@ -246,10 +253,7 @@ def step_memoryless(
         columns = median_columns(medians)
         found = _estimate(model, rule, columns, group, None, shared, return_cov)
         return later, StepOutput(*found[:-1])
-    out = run_memoryless(model, rule, medians, frames, return_cov)
-    values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
-    first = (None if value is None else value[:, 0] for value in values)
-    return later, StepOutput(*first)  # type: ignore[arg-type]
+    return later, first_step(run_memoryless(model, rule, medians, frames, return_cov))
 
 
 class _Group(NamedTuple):

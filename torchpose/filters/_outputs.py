@@ -122,6 +122,16 @@ def collect(steps: Sequence[StepOutput], lengths: Int[Tensor, " B"]) -> FilterOu
     )
 
 
+def first_step(out: FilterOutput) -> StepOutput:
+    """Return the first frame of a run as a step."""
+    cov, mended, jitter = (
+        None if value is None else value[:, 0] for value in (out.cov, out.mended, out.jitter)
+    )
+    return StepOutput(
+        out.mean[:, 0], out.log_weights[:, 0], out.log_evidence[:, 0], cov, mended, jitter
+    )
+
+
 def finish_output(
     mean: Float[Tensor, "B T D"],
     log_weights: Float[Tensor, "B T M"],

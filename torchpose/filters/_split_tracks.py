@@ -23,7 +23,7 @@ from torchpose.filters._joint_tracks import (
 )
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters._outputs import FilterOutput, StepOutput, mending
+from torchpose.filters._outputs import FilterOutput, StepOutput, first_step, mending
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, require_state
 from torchpose.filters._split_candidates import (
@@ -165,13 +165,10 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         frames = frame.as_sequences()
         (own,) = self._frames(frames, state.time)
         log_weights, step = self._step(tracks, CandidateRoom(), state.log_weights, own, return_cov)
-        out = stacked([step], frames)
-        values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
         group = torch.arange(len(log_weights), device=log_weights.device)
         mean, cov = tracks.mean.to(self.dtype), symmetrise(tracks.cov)
-        first = (None if value is None else value[:, 0] for value in values)
         new_state = MKFState(log_weights, mean, cov, group, state.time + 1)
-        return new_state, StepOutput(*first)  # type: ignore[arg-type]
+        return new_state, first_step(stacked([step], frames))
 
     def _frames(self, frames: Measurements, first: int) -> list[_SplitFrame]:
         """Return the frames of some sequences, of which the first one has number `first`."""

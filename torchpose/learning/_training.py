@@ -390,7 +390,7 @@ def seen_keypoints(
         The prior's pixels; elbows and shoulders are NaN, as is whatever is NaN in the poses.
     """
     views = sample_viewpoints(len(poses), ViewRange(**info.views).scaled(view_share), generator)
-    rotation = euler_to_matrix(views.angles, info.rotation_order)  # type: ignore[arg-type]
+    rotation = euler_to_matrix(views.angles, info.rotation_order)
     pixels = project(poses, info.matrix, rotation[:, None], views.translation[:, None])[..., :2]
     noise = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     keypoints = pixels + noise_std * noise

@@ -99,21 +99,21 @@ def fit_upper_body_prior(
         InputError: no recordings or no complete frames. PriorError: kinds of joints that cannot be
             mixed, unknown rotation order.
     """
-    check_rotation_order(rotation_order)
+    order = check_rotation_order(rotation_order)
     camera = camera or PinholeCamera(*KINECT_CAMERA, width=640, height=480)
     (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
     if skew:
         raise PriorError(f"the camera of a prior must have no skew, got {skew:g} pixels")
     poses = collect_poses(recordings, neck, centre, nose_as_head)
     sources = arm_sources(
-        poses, camera.matrix, seed, views, rotation_order, mirror, n_samples, views_per_pose
+        poses, camera.matrix, seed, views, order, mirror, n_samples, views_per_pose
     )
     options: dict[str, Any] = {"n_components": n_components, "seed": seed, "progress": progress}
     options |= fit_options
     left = _fit_arm(sources.left, options)
     right = None if sources.right is None else _fit_arm(sources.right, options)
     info = PriorInfo(
-        name=name, rotation_order=rotation_order, fx=fx, fy=fy, cx=cx, cy=cy, licence=licence,
+        name=name, rotation_order=order, fx=fx, fy=fy, cx=cx, cy=cy, licence=licence,
         command=command, views=asdict(views), **sources.facts,
     )  # fmt: skip
     return prior_of_arms(left, right, info, seed)

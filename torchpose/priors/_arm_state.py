@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
-from torchpose.camera._projection import project
+from torchpose.camera._projection import lift, project
 from torchpose.camera._viewpoints import Viewpoints
 from torchpose.errors import InputError, PriorError
 from torchpose.math._rotations import ROTATION_ORDERS, RotationOrder, euler_to_matrix
@@ -101,6 +101,15 @@ def arm_states(
     check_finite("joints", joints, hint="drop poses with missing joints")
     left, right = joints[:, list(LEFT_ARM)], joints[:, list(RIGHT_ARM)]
     return arm_state(left, views, matrix, order), arm_state(right, views, matrix, order)
+
+
+def arm_in_body_axes(
+    state: Float[Tensor, "*batch D"], matrix: Float[Tensor, "3 3"], order: RotationOrder
+) -> Float[Tensor, "*batch 5 3"]:
+    """Return the joints of an arm in the axes of the body (BL 5)."""
+    rotation = euler_to_matrix(state[..., 15:18], order)
+    joints = state[..., :15].unflatten(-1, (5, 3))
+    return lift(joints, matrix.to(state), rotation, state[..., 18:21])
 
 
 def mirror_arm_state(state: Float[Tensor, "*batch 21"], cx: float) -> Float[Tensor, "*batch 21"]:

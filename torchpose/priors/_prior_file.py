@@ -21,6 +21,7 @@ from torchpose._core.tensor_file import (
 )
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, PriorError
+from torchpose.math._rotations import RotationOrder
 from torchpose.priors._arm_state import check_rotation_order
 
 SKELETON = "upper-body-8"
@@ -53,7 +54,7 @@ class PriorInfo:
     """
 
     name: str = ""
-    rotation_order: str = "zxy"
+    rotation_order: RotationOrder = "zxy"
     fx: float = 525.0
     fy: float = 525.0
     cx: float = 319.5

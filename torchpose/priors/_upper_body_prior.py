@@ -21,7 +21,6 @@ from torchpose.camera._projection import arm_in_body_frame, join_arms
 from torchpose.errors import FileFormatError, InputError, OverlapError, PriorError, TorchposeError
 from torchpose.priors._arm_state import (
     STATE_DIM,
-    check_rotation_order,
     mirror_covariance,
     mirror_mixture,
 )
@@ -119,7 +118,7 @@ class UpperBodyPrior(nn.Module):
 
     def mean_pose(self) -> Float[Tensor, "8 3"]:
         """Return the mean of the mixtures over poses in the body frame, metres: the least to be beaten."""
-        order, matrix = check_rotation_order(self.info.rotation_order), self.info.matrix
+        order, matrix = self.info.rotation_order, self.info.matrix
         arms = []
         for arm in (self.left, self.right):
             joints, _ = arm_in_body_frame(arm.means, arm.covariances, matrix, order)

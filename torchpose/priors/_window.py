@@ -19,7 +19,7 @@ from torchpose.camera._viewpoints import Viewpoints
 from torchpose.camera._virtual_camera import BodyPath
 from torchpose.errors import PriorError
 from torchpose.math._rotations import euler_to_matrix
-from torchpose.priors._arm_state import STATE_DIM, mirror_arm_state
+from torchpose.priors._arm_state import STATE_DIM, check_rotation_order, mirror_arm_state
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.skeleton._torso import in_torso_axes
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, mirror_pose, scale_bones
@@ -224,7 +224,8 @@ def window_state(
             window. layout: the hands of a window. side: "left" or "right". matrix: K, without skew.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
     """
-    rotation = euler_to_matrix(views.angles, rotation_order)[:, None]  # type: ignore[arg-type]
+    order = check_rotation_order(rotation_order)
+    rotation = euler_to_matrix(views.angles, order)[:, None]
     place = views.translation[:, None]
     at = {lag: i for i, lag in enumerate(layout.lags)}
     own, other = _HANDS[side]

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.filters._outputs import first_not_finite
-from torchpose.math._rotations import RotationOrder
 from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS
@@ -97,7 +96,7 @@ class MultipleModelFilter(Estimator):
         self.articulated = ArticulatedFilter(model, arms)
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix.to(model.measurement_cov)
-        self.order: RotationOrder = model.prior.info.rotation_order  # type: ignore[assignment]
+        self.order = model.prior.info.rotation_order
 
     def init(
         self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators

@@ -66,8 +66,7 @@ class PoseReader(NamedTuple):
     @property
     def order(self) -> RotationOrder:
         """Return the order of roll, pitch and yaw in the prior."""
-        order: RotationOrder = self.prior.info.rotation_order  # type: ignore[assignment]
-        return order
+        return self.prior.info.rotation_order
 
     def read(
         self,

@@ -11,9 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_count
-from torchpose.camera._projection import lift
 from torchpose.errors import InputError
-from torchpose.math._rotations import RotationOrder, euler_to_matrix
+from torchpose.priors._arm_state import arm_in_body_axes
 from torchpose.viz._skeletons import ARM_LIMBS, _limits, _set_view, draw_skeleton
 from torchpose.viz._style import (
     GRID,
@@ -162,10 +161,7 @@ def _on_one_body(prior: UpperBodyPrior, mixture: str) -> bool:
 
 def _in_body(prior: UpperBodyPrior, states: Float[Tensor, "*batch 21"]) -> Tensor:
     """Return the hand, elbow, shoulder, head and neck of states in body axes, metres, from the neck."""
-    order: RotationOrder = prior.info.rotation_order  # type: ignore[assignment]
-    rotation = euler_to_matrix(states[..., 15:18], order)
-    joints = states[..., :15].unflatten(-1, (5, 3))
-    joints = lift(joints, prior.info.matrix, rotation, states[..., 18:21])
+    joints = arm_in_body_axes(states, prior.info.matrix, prior.info.rotation_order)
     return joints - joints[..., 4:, :]
 
 

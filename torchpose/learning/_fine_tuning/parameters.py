@@ -7,9 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.camera._projection import lift
 from torchpose.math._mixture_steps import MixtureParameters
-from torchpose.math._rotations import euler_to_matrix
 from torchpose.metrics._pose_errors import ALIGN_JOINTS, procrustes
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo
@@ -147,15 +145,6 @@ def pose_error(
         motion = procrustes(estimate[..., chosen, :], truth[..., chosen, :])
     moved = estimate @ motion.rotation.mT + motion.translation[..., None, :]
     return ((moved - truth).square().sum(-1) + _SMOOTH**2).sqrt() - _SMOOTH
-
-
-def arm_in_body_axes(
-    state: Float[Tensor, "*batch D"], matrix: Tensor, order: str
-) -> Float[Tensor, "*batch 5 3"]:
-    """Return the joints of an arm in the axes of the body (BL 5)."""
-    rotation = euler_to_matrix(state[..., 15:18], order)  # type: ignore[arg-type]
-    joints = state[..., :15].unflatten(-1, (5, 3))
-    return lift(joints, matrix.to(state), rotation, state[..., 18:21])
 
 
 def tuned_info(prior: UpperBodyPrior, what: str) -> PriorInfo:

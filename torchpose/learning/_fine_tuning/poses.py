@@ -17,13 +17,13 @@ from torchpose.learning._fine_tuning.parameters import (
     Fraction,
     Positive,
     TunableMixture,
-    arm_in_body_axes,
     departure_of,
     pose_error,
     tuned_info,
     tuned_mixtures,
 )
 from torchpose.learning._training import seen_keypoints
+from torchpose.priors._arm_state import arm_in_body_axes
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import augment_bodies

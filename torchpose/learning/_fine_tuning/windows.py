@@ -15,7 +15,6 @@ from torchpose.learning._fine_tuning.parameters import (
     Fraction,
     Positive,
     TunableMixture,
-    arm_in_body_axes,
     departure_of,
     pose_error,
     tuned_info,
@@ -23,7 +22,7 @@ from torchpose.learning._fine_tuning.parameters import (
 )
 from torchpose.learning._samplers import WindowSource
 from torchpose.math._mixture_steps import MixtureParameters
-from torchpose.priors._arm_state import STATE_DIM
+from torchpose.priors._arm_state import STATE_DIM, arm_in_body_axes
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS

@@ -267,7 +267,7 @@ class UpperBodyRecipe:
         facts = facts | {"extra": facts["extra"] | {"recipe": VERSION}}
         fx, fy, cx, cy = self.camera_matrix
         info = PriorInfo(
-            name=name, rotation_order=self.rotation_order, fx=fx, fy=fy, cx=cx, cy=cy,
+            name=name, rotation_order=check_rotation_order(self.rotation_order), fx=fx, fy=fy, cx=cx, cy=cy,
             licence=licence, command=command, views=asdict(self.views), **facts,
         )  # fmt: skip
         base = prior_of_arms(mixtures["pose"], mixtures.get("pose.right"), info, self.seed)
