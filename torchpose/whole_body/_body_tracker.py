@@ -1,16 +1,14 @@
 """Track whole bodies: from keypoints or silhouettes in calibrated cameras to the poses of one person."""
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, Self, Unpack, overload
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_rate, check_shape, check_tensors
+from torchpose._core.checks import check_rate, check_tensors
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import as_one_run, in_own_precision
@@ -20,7 +18,6 @@ from torchpose.body._kinematics import Body
 from torchpose.camera._choice import check_room
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
-from torchpose.filters._measurements import check_lengths
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._body_motion import BodyMotion
@@ -34,20 +31,17 @@ from torchpose.whole_body._body_arguments import (
     given_of,
     keypoints_alone,
     refuse,
-    whole_length,
 )
-from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
+from torchpose.whole_body._body_track import BodyTrack, load_body
 from torchpose.whole_body._filter_table import BodyTrackerOptions, choose_method
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._following import Observed
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker, LiveBody
-from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 from torchpose.whole_body._measured_keypoints import given_keypoints
-from torchpose.whole_body._particle_follower import ParticleFollower
-from torchpose.whole_body._particle_setup import particle_setup
+from torchpose.whole_body._particle_setup import set_up_particles
 
 
 class BodyStream(NamedTuple):
@@ -187,21 +181,18 @@ class BodyTracker(nn.Module):
         of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
         refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
         self.method = choose_method(method, given)
-        setup = particle_setup(
-            self.method, given, body, height, fps, n_particles,
-            {**options, **given_of({"process_cov": process_cov})},
+        self._by_particles = set_up_particles(
+            self.method, rig, given, body, height, self.fps, n_particles,
+            {**options, **given_of({"process_cov": process_cov})}, (keypoint_std, pixel_std),
         )  # fmt: skip
-        self.filter, self.notes = setup.filter, setup.notes
+        self.filter, self.notes = self._by_particles.filter, self._by_particles.notes
         self.cameras, self.n_particles = rig, n_particles
-        self._upright, self._search = setup.upright, setup.manifold
+        # registered, so that they move with the tracker
+        self._upright, self._search = self._by_particles.start_body, self._by_particles.start_prior
         std = None
         if initial_cov is not None:
             std = std_of_covariance("initial_cov", initial_cov, self.body.dim)
         self.register_buffer("_initial_std", std, persistent=std is not None)
-        self._by_particles = ParticleFollower(
-            self.method, self.filter, self.cameras, self.fps, self._upright, self._search,
-            (keypoint_std, pixel_std),
-        )  # fmt: skip
 
     _initial_std: Tensor | None
 
@@ -316,26 +307,11 @@ class BodyTracker(nn.Module):
             return people.forward(keypoints, confidence, names, **options)
         check_filters_one(self.method, smoothing, refine, persons)
         check_facing(facing, initial_state, keypoints)
-        source, measured = self._by_particles.observed(
-            silhouettes, given_keypoints(keypoints, confidence, names, covariance)
-        )
-        frames = source if lengths is None else islice(source, whole_length(lengths))
-        begun, first = self._by_particles.first_seen(frames, measured)
-        looked_at = 1 if initial_state is not None else self._by_particles.looked_at
-        begin = [first, *islice(frames, looked_at - 1)]
-        if initial_state is None:
-            initial_state = self._by_particles.first_state(begin, generator, facing)
-        state = self._begun(initial_state, generator)._replace(frame=begun)
-        expected = None if n_frames is None else max(1, n_frames - begun)
-        bar = tqdm(chain(begin, frames), total=expected, disable=not progress, unit="frame")
-        poses = self._tracked(state, iter(bar))[1]
-        if lengths is not None:
-            there, later = begun + len(poses), sum(1 for _ in source)
-            check_lengths(lengths, 1, there + later, lengths.device)
-            poses = repeat_last(poses, later)
-        unseen = "not all cameras saw somebody" if measured is None else TOO_FEW
-        poses.notes += late_note(begun, unseen)
-        return poses
+        given = given_keypoints(keypoints, confidence, names, covariance)
+        return self._by_particles.track(
+            silhouettes, given, initial_state, self.initial_cov, generator,
+            facing=facing, lengths=lengths, n_frames=n_frames, progress=progress,
+        )  # fmt: skip
 
     @uncompiled
     @takes_former_arguments
@@ -388,15 +364,8 @@ class BodyTracker(nn.Module):
             given = given_keypoints(keypoints, confidence, names, covariance)
             frames = list(self._by_particles.observed(silhouettes, given)[0])
             initial_state = self._by_particles.first_state(frames, generator, facing)
-        return self._begun(initial_state, generator)._replace(names=_names(names))
-
-    def _begun(self, initial_state: Tensor, generator: torch.Generator | None) -> BodyStream:
-        """Return the state of particles before the first frame."""
-        check_shape("initial_state", initial_state, [self.body.dim])
-        state = self.filter.init(
-            initial_state[None], generator=generator, initial_cov=self.initial_cov
-        )
-        return BodyStream(state, 0, generator)
+        first = self._by_particles.begin(initial_state, self.initial_cov, generator)
+        return BodyStream(first, 0, generator, _names(names))
 
     @overload
     def step(
@@ -513,8 +482,6 @@ class BodyTracker(nn.Module):
         if not isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         after, poses = self._by_particles.follow(state.filter, frames, state.generator, state.frame)
-        poses.fps, poses.method = self.fps, self.method
-        poses.notes = (*self.notes, *poses.notes)
         return state._replace(filter=after, frame=state.frame + len(poses)), poses
 
     def extra_repr(self) -> str:

@@ -2,23 +2,28 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_shape
 from torchpose._core.module_state import derived
 from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
-from torchpose.whole_body._body_track import BodyTrack
+from torchpose.filters._measurements import check_lengths
+from torchpose.whole_body._body_arguments import whole_length
+from torchpose.whole_body._body_track import BodyTrack, repeat_last
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._first_pose import find_first_pose
 from torchpose.whole_body._following import Observed, all_see, follow
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 from torchpose.whole_body._measured_keypoints import (
     BodyKeypointMeasurer,
     GivenKeypoints,
@@ -37,7 +42,7 @@ class ParticleFollower:
         fps: frames per second.
         start_body: the body with which the first pose is found; None for the filter's own.
         start_prior: the manifold in which it is looked for; None for the filter's own, if it has one.
-        noise: of keypoints, metres and pixels; None for the usual ones.
+        noise: of keypoints, metres and pixels; None for the usual ones. notes: on models that were rescaled.
     """
 
     method: str
@@ -47,6 +52,7 @@ class ParticleFollower:
     start_body: Body | None
     start_prior: Any
     noise: tuple[float | None, float | None]
+    notes: tuple[str, ...]
 
     @property
     def upright(self) -> Body:
@@ -67,6 +73,39 @@ class ParticleFollower:
             self.filter, "measurer", sources,
             lambda: BodyKeypointMeasurer(self.cameras, self.fps, self.upright, *self.noise),
         )  # fmt: skip
+
+    def track(
+        self,
+        silhouettes: Iterable[Tensor] | None,
+        given: GivenKeypoints | None,
+        initial_state: Tensor | None,
+        initial_cov: Tensor,
+        generator: torch.Generator | None,
+        *,
+        facing: Tensor | None,
+        lengths: Tensor | None,
+        n_frames: int | None,
+        progress: bool,
+    ) -> BodyTrack:
+        """Track a whole sequence, as `BodyTracker.forward`."""
+        source, measured = self.observed(silhouettes, given)
+        frames = source if lengths is None else islice(source, whole_length(lengths))
+        begun, first = self.first_seen(frames, measured)
+        looked_at = 1 if initial_state is not None else self.looked_at
+        begin = [first, *islice(frames, looked_at - 1)]
+        if initial_state is None:
+            initial_state = self.first_state(begin, generator, facing)
+        state = self.begin(initial_state, initial_cov, generator)
+        expected = None if n_frames is None else max(1, n_frames - begun)
+        bar = tqdm(chain(begin, frames), total=expected, disable=not progress, unit="frame")
+        poses = self.follow(state, iter(bar), generator, begun)[1]
+        if lengths is not None:
+            there, later = begun + len(poses), sum(1 for _ in source)
+            check_lengths(lengths, 1, there + later, lengths.device)
+            poses = repeat_last(poses, later)
+        unseen = "not all cameras saw somebody" if measured is None else TOO_FEW
+        poses.notes += late_note(begun, unseen)
+        return poses
 
     def observed(
         self, silhouettes: Iterable[Tensor] | None, given: GivenKeypoints | None
@@ -138,6 +177,14 @@ class ParticleFollower:
         own: Any = self.filter.body
         return found if self.start_body is None else self.start_body.convert(found, own)
 
+    def begin(
+        self, initial_state: Tensor, initial_cov: Tensor, generator: torch.Generator | None
+    ) -> BodyFilterState:
+        """Return the state before the first frame, of the pose [D] of the filter's body."""
+        body: Any = self.filter.body
+        check_shape("initial_state", initial_state, [body.dim])
+        return self.filter.init(initial_state[None], generator=generator, initial_cov=initial_cov)
+
     def follow(
         self,
         state: BodyFilterState,
@@ -146,7 +193,10 @@ class ParticleFollower:
         first_frame: int,
     ) -> tuple[BodyFilterState, BodyTrack]:
         """Return the state after some frames, and the poses in them."""
-        return follow(self.filter, state, frames, self.cameras, generator, first_frame)
+        after, poses = follow(self.filter, state, frames, self.cameras, generator, first_frame)
+        poses.fps, poses.method = self.fps, self.method
+        poses.notes = (*self.notes, *poses.notes)
+        return after, poses
 
 
 def _masks(one: Observed) -> Tensor:

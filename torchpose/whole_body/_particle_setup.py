@@ -2,45 +2,34 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
+from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_track import load_body
 from torchpose.whole_body._filter_table import LEARNT, METHODS, make_filter, rebased
-from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body._particle_follower import ParticleFollower
 
 _HEIGHT = 1.75  # metres, of a person of unknown height
 
 
-class ParticleSetup(NamedTuple):
-    """Holds what `BodyTracker` tracks with.
-
-    Attributes:
-        filter: the particle filter. upright: body with which the first pose is found; None for that of the
-            filter, so that its tensors are in the state once. manifold: of poses for the first pose, if the
-            filter holds none itself. notes: on models that were rescaled.
-    """
-
-    filter: SilhouetteParticleFilter
-    upright: Body | None
-    manifold: Any
-    notes: tuple[str, ...]
-
-
-def particle_setup(
+def set_up_particles(
     method: str,
+    rig: CameraRig,
     given: Mapping[str, Any],
     body: Body | str | Path | None,
     height: float | None,
     fps: float,
     n_particles: int,
     options: Mapping[str, Any],
-) -> ParticleSetup:
-    """Return the filter of a method, and what finds its first pose.
+    noise: tuple[float | None, float | None],
+) -> ParticleFollower:
+    """Return the filter of a method with what finds its first pose.
 
     Args:
-        method: among `METHODS`. given: models, names or files by kind. options: of the filter.
+        method: among `METHODS`. rig: the cameras. given: models, names or files by kind.
+        options: of the filter. noise: of keypoints, metres and pixels.
         body, height, fps, n_particles: as `BodyTracker`.
     """
     found = {kind: _model(kind, value, fps) for kind, value in given.items()}
@@ -51,7 +40,10 @@ def particle_setup(
     own = METHODS[method].needs == "manifold"  # then the filter holds it
     manifold = None if own else models.get("manifold")
     notes = tuple(note for _, note in found.values() if note)
-    return ParticleSetup(particles, None if upright is tracked else upright, manifold, notes)
+    start_body = (
+        None if upright is tracked else upright
+    )  # so that its tensors are in the state once
+    return ParticleFollower(method, particles, rig, fps, start_body, manifold, noise, notes)
 
 
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
