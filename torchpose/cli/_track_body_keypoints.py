@@ -4,7 +4,7 @@ import copy
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -100,10 +100,8 @@ def track_keypoints(
         shown = list(inputs)
     overlay = job.overlay and shown is not None
     with ExitStack() as stack:
-        films = None
-        outlined = settings.silhouettes is not None
-        if shown is not None and (overlay or job.pictures or outlined):
-            films = stack.enter_context(Films(shown, cameras, settings.delays))
+        wanted = overlay or job.pictures or settings.silhouettes is not None
+        films = stack.enter_context(_films(shown if wanted else None, cameras, settings))
         results = stack.enter_context(
             body_results(job, cameras, overlay, _more(job, shown is not None, settings))
         )
@@ -112,14 +110,7 @@ def track_keypoints(
             other_rates=[] if films is None else films.rates,
             everybody=settings.persons is not None,
         )  # fmt: skip
-        recordings = None
-        if shown is not None and settings.silhouettes is not None:
-            recordings = stack.enter_context(
-                Recordings(
-                    shown, cameras, fps=keypoints.fps, delays=settings.delays,
-                    **settings.silhouettes._asdict(),
-                )
-            )  # fmt: skip
+        recordings = stack.enter_context(_recordings(shown, cameras, keypoints.fps, settings))
         start = time.perf_counter()
         people = _track(keypoints, settings, recordings)
         seconds = time.perf_counter() - start
@@ -142,6 +133,26 @@ def track_keypoints(
         print(f"torchpose: {_DISAGREE}", file=sys.stderr)
         return 1
     return code
+
+
+def _films(
+    videos: list[str] | None, cameras: "Sequence[PinholeCamera]", settings: KeypointSettings
+) -> AbstractContextManager[Films | None]:
+    """Return the videos into which the body is drawn, if there are some."""
+    return nullcontext() if videos is None else Films(videos, cameras, settings.delays)
+
+
+def _recordings(
+    videos: list[str] | None,
+    cameras: "Sequence[PinholeCamera]",
+    fps: float,
+    settings: KeypointSettings,
+) -> AbstractContextManager[Recordings | None]:
+    """Return the videos whose silhouettes count beside the keypoints, if they are to."""
+    if videos is None or settings.silhouettes is None:
+        return nullcontext()
+    own = settings.silhouettes._asdict()
+    return Recordings(videos, cameras, fps=fps, delays=settings.delays, **own)
 
 
 def _nobody(keypoints: BodyKeypoints) -> str:

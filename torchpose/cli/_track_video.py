@@ -26,6 +26,7 @@ from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.io._results import ResultsFolder
     from torchpose.video._recording import TrackedPerson
     from torchpose.video._source_interface import VideoSource
     from torchpose.video._video_tracker import VideoTracker
@@ -83,16 +84,7 @@ def track_video(
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         names = _names(people, source.reopenable)
-        # first of all: the rest only shows them
-        written = results.commit(write_people(people, results.stage))
-        # Python is free for the pictures for most of the time that the encoder takes
-        with ThreadPoolExecutor(1) as beside:
-            drawing = beside.submit(_pictures_of, people[0], results.stage, pictures)
-            try:
-                if overlay and source.reopenable:
-                    write_overlay(results.stage / _OVERLAY, source.reopen(), people, n_frames)
-            finally:
-                written += results.commit(drawing.result())
+        written = _write_poses(people, source, n_frames, results, pictures, overlay)
         if overlay:
             title = Path(job.input).name
             shown = _write_report(results.stage, people, names, n_frames, facts, notes, title)
@@ -117,6 +109,27 @@ def _note_on_turn(
     return (
         f"faces are upright if the video is turned by {turn} degrees clockwise: turn it, and track it again",
     )
+
+
+def _write_poses(
+    people: list["TrackedPerson"],
+    source: "VideoSource",
+    n_frames: int,
+    results: "ResultsFolder",
+    pictures: bool,
+    overlay: bool,
+) -> list[Path]:
+    """Write the poses of everybody, then what shows them: pictures, and the overlay of a recording."""
+    written = results.commit(write_people(people, results.stage))
+    # Python is free for the pictures for most of the time that the encoder takes
+    with ThreadPoolExecutor(1) as beside:
+        drawing = beside.submit(_pictures_of, people[0], results.stage, pictures)
+        try:
+            if overlay and source.reopenable:
+                write_overlay(results.stage / _OVERLAY, source.reopen(), people, n_frames)
+        finally:
+            written += results.commit(drawing.result())
+    return written
 
 
 def _pictures_of(person: "TrackedPerson", out: Path, wanted: bool) -> list[Path]:
