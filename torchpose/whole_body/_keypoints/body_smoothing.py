@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpose.body._articulation import BodyPoint
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
-from torchpose.whole_body._keypoints.nested import PART, mapped, part_of, stacked
+from torchpose.whole_body._keypoints.nested import PART, frame_at, mapped, part_of, stacked
 
 
 class BodyMoments(NamedTuple):
@@ -67,7 +67,7 @@ def _smoothed(
     body, found = filter.articulation, [after]
     ahead, predicted, gains = _gains(filter, filtered, widened, started)
     for t in range(predicted.shape[1] - 1, -1, -1):
-        (mean, cov), expected = mapped(lambda value: value[:, t], (filtered, ahead))  # noqa: B023
+        (mean, cov), expected = frame_at((filtered, ahead), t)
         off = body.difference(found[-1].mean, expected)
         step = (gains[:, t] @ off[..., None]).squeeze(-1)
         change = gains[:, t] @ (found[-1].cov - predicted[:, t]) @ gains[:, t].mT

@@ -13,7 +13,7 @@ from torchpose.whole_body._keypoints.foot_filter import (
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
-from torchpose.whole_body._keypoints.nested import PART, FrameCollector, by_parts, mapped
+from torchpose.whole_body._keypoints.nested import PART, FrameCollector, by_parts, frame_at, mapped
 from torchpose.whole_body._keypoints.turned_cameras import is_turned, turned
 
 
@@ -70,7 +70,7 @@ def track_feet(
     n_frames = poses.started.shape[1]
     found = FrameCollector(n_frames)
     for t in range(n_frames):
-        legs, frame, believed = mapped(lambda value: value[:, t], (every, frames, beliefs))  # noqa: B023
+        legs, frame, believed = frame_at((every, frames, beliefs), t)
         state, feet = filter.advance(state, legs, frame, maps, believed, poses.started[:, t])
         found.add((state, feet) if smoothing else feet)
     if not smoothing:

@@ -51,6 +51,7 @@ from torchpose.whole_body._keypoints.lone_camera import (
 )
 from torchpose.whole_body._keypoints.nested import (
     FrameCollector,
+    frame_at,
     part_of,
     replaced,
     taken,
@@ -118,7 +119,7 @@ class KeypointTracker(nn.Module):
         stream: KeypointStream | None = None
         every = FrameCollector(n_frames)
         for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
-            frame = frames.map(lambda value: value[:, t])  # noqa: B023
+            frame: KeypointFrame = frame_at(frames, t)
             stream, pose, found = self.advance(stream, frame, waited=waited, watch=watch)
             every.add(to_be_smoothed(pose, found) if smoothing else pose)
         return self.smoothed(*every.sequence) if smoothing else every.sequence

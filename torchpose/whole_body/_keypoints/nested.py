@@ -23,9 +23,14 @@ def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
     return type(first)(*values) if hasattr(first, "_fields") else tuple(values)
 
 
-def taken(value: Any, index: Tensor) -> Any:
-    """Return some elements of the batch, of a tensor or of named tuples of tensors."""
+def taken(value: Any, index: Tensor | int) -> Any:
+    """Return some elements of the batch, or one of them, of a tensor or of named tuples of tensors."""
     return mapped(lambda tensor: tensor[index], value)
+
+
+def frame_at(value: Any, time: int) -> Any:
+    """Return one frame [B, ...] of a tensor [B, T, ...], or of named tuples of tensors."""
+    return mapped(lambda tensor: tensor[:, time], value)
 
 
 def replaced(value: Any, index: Tensor, other: Any) -> Any:

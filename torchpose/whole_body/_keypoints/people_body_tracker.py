@@ -105,7 +105,7 @@ class PeopleBodyTracker:
         stream, rows = None, defaultdict[int, list[_Row]](list)
         strays = torch.zeros(frames.inlier.shape[0], frames.inlier.shape[2], dtype=torch.bool)
         for t in tqdm(range(len(keypoints)), disable=not progress, unit="frame"):
-            frame = frames.map(lambda value: value[t])  # noqa: B023
+            frame: KeypointFrame = taken(frames, t)
             stream, found = self.people.advance(stream, frame)
             if found is None:
                 continue
@@ -205,8 +205,7 @@ class PeopleBodyTracker:
         check_conventions(self.single.rig, filter, of_one)
         stride = max(1, len(frames.pixels) // _FRAMES)
         pairs = [
-            pairs_of_detections(frames.map(lambda value: value[t]))  # noqa: B023
-            for t in range(0, len(frames.pixels), stride)
+            pairs_of_detections(taken(frames, t)) for t in range(0, len(frames.pixels), stride)
         ]
         found = KeypointFrame(*(torch.cat(values) for values in zip(*pairs, strict=True)))
         agreed = triangulate(filter.maps, found).isfinite().all(-1).sum(-1)
@@ -226,10 +225,7 @@ class PeopleBodyTracker:
         standing = None
         if feet is not None:
             seen = [
-                taken_detections(
-                    feet.map(lambda value: value[row.time]),  # noqa: B023
-                    row.frame.detection[[row.row]],
-                )
+                taken_detections(taken(feet, row.time), row.frame.detection[[row.row]])
                 for row in rows
             ]
             standing = self.single.feet_of(poses, stacked(seen), smoothing)
