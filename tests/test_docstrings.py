@@ -84,6 +84,13 @@ def function_of(member: Any) -> Callable[..., Any] | None:
     return inspect.unwrap(member) if inspect.isfunction(member) else None
 
 
+def overridden_docs(cls: type, name: str) -> list[str]:
+    """Return the docstrings of a method in a class and in those of its bases that have one, in this order."""
+    found = [vars(base)[name] for base in ours(cls) if name in vars(base)]
+    docs = [doc for one in found if (doc := (function_of(one) or one).__doc__)]
+    return [inspect.cleandoc(doc) for doc in docs]
+
+
 def members(cls: type) -> Iterator[Documented]:
     """Yield the public methods and properties of a class that torchpose defines, inherited ones too."""
     names = {n for base in ours(cls) for n in vars(base) if not n.startswith("_")}
@@ -94,10 +101,8 @@ def members(cls: type) -> Iterator[Documented]:
         node = None if function is None or name in HOOKS else definition(function)
         if function is not None and node is not None:
             kind = "property" if isinstance(member, property | cached_property) else "function"
-            overridden = [vars(base)[name] for base in ours(cls) if name in vars(base)]
-            docs = [doc for one in overridden if (doc := (function_of(one) or one).__doc__)]
             label = f"{function.__module__}.{function.__qualname__}"
-            yield Documented(label, kind, with_inherited([inspect.cleandoc(d) for d in docs]), node)
+            yield Documented(label, kind, with_inherited(overridden_docs(cls, name)), node)
 
 
 def with_inherited(docs: list[str]) -> str:
@@ -281,6 +286,18 @@ def problems() -> dict[str, list[str]]:
 def test_every_public_docstring_is_complete():
     found = problems()
     assert not found, "\n".join(f"{name}: {'; '.join(faults)}" for name, faults in found.items())
+
+
+def test_methods_repeat_no_section_of_the_methods_that_they_override():
+    found = []
+    for room in ROOMS:
+        module = import_module(room)
+        for cls in filter(inspect.isclass, (getattr(module, name) for name in module.__all__)):
+            for name in {name for base in ours(cls) for name in vars(base)} - {"__init__"}:
+                own, *below = map(sections, overridden_docs(cls, name) or [""])
+                inherited = set().union(*(base.items() for base in below[:1]))
+                found += [f"{cls.__name__}.{name}: {k}" for k, _ in own.items() & inherited]
+    assert sorted(set(found)) == []
 
 
 def test_the_public_names_are_found():

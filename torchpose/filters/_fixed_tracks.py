@@ -222,15 +222,6 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         Filters whose frames do not depend on each other have nothing to smooth: their estimates are
         those of `forward`.
 
-        Args:
-            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
-                [B].
-            lag: number of later frames that an estimate may use; None is all of them.
-            return_cov: whether to return covariances as well.
-
-        Returns:
-            `FilterOutput` with smoothed means [B, T, D].
-
         Raises:
             InputError: the filter resets its weights (`reset_below`), which cuts the past off.
 

@@ -260,9 +260,6 @@ class MixtureKalmanFilter(RecursiveFilter):
 
         Returns:
             `MKFState` with means [B, M, D].
-
-        Raises:
-            InputError: batch_size below 1.
         """
         check_count("batch_size", batch_size)
         return MKFState(

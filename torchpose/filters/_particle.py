@@ -236,9 +236,6 @@ class BootstrapParticleFilter(RecursiveFilter):
 
         Returns:
             `ParticleState` with N particles for each element.
-
-        Raises:
-            InputError: batch_size below 1.
         """
         check_count("batch_size", batch_size)
         weights = self.weights.double().expand(batch_size, -1)

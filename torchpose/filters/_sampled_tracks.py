@@ -85,12 +85,6 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
 
         Args:
             batch_size: B. generator: one generator, or a list of one for each element.
-
-        Returns:
-            `MKFState` with means [B, M, D].
-
-        Raises:
-            InputError: batch_size below 1.
         """
         check_count("batch_size", batch_size)
         drawn = self._draw_components(batch_size, generator)

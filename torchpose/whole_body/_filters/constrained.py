@@ -139,9 +139,6 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
         """Return the action of every new particle, or its index, by which its copies are recognised.
 
-        Args:
-            particles: [B, N, D], metres and quaternion vectors.
-
         Returns:
             [B, N] integers; None where neither is needed.
         """
@@ -155,10 +152,6 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
         """Return the memory of particles of which some have exchanged their legs: no copies of the others.
 
-        Args:
-            memory: the memory of the particles, as in the state.
-            swapped: [B, N], True where a particle has exchanged its legs.
-
         Returns:
             Memory of the same shape; that of actions as it was.
         """
@@ -168,9 +161,6 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor:
         """Return the velocity, zero, and the estimate before the first frame.
-
-        Args:
-            mean: the first estimate [B, D].
 
         Returns:
             [B, 2, D], in the units of a step and of the state.

@@ -184,9 +184,6 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N V 3 3"]:
         """Return the covariances of the parts of new hypotheses.
 
-        Args:
-            particles: [B, N, D], metres and quaternion vectors.
-
         Returns:
             [B, N, P - 1, 3, 3], squares of sines of half angles.
         """
