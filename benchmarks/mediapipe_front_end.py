@@ -220,8 +220,9 @@ def unseen_signers(bench: Bench, errors: dict[tuple[float, float], Tensor]) -> l
         place = min(errors, key=lambda p: float(errors[p][:, ~own].mean()))
         elbows, shoulders = errors[place][:, own].mean(1).tolist()
         sentences.append(
-            f"Head and neck chosen without {', '.join(signer)}: {place[0]:g} and {place[1]:.0%}; "
-            f"on those clips elbows {elbows:.3f}, shoulders {shoulders:.3f}."
+            f"Without the clips {', '.join(signer)}, the best is a head at {place[0]:g} with a neck at "
+            f"{place[1]:.0%}. On those clips it has errors of {elbows:.3f} at elbows, {shoulders:.3f} at "
+            "shoulders."
         )
     return sentences
 
