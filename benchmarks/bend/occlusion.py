@@ -42,13 +42,13 @@ class HiddenArm(NamedTuple):
     near: dict[str, Tensor]
 
 
-def visible_share(tracked: BendPerson, view: View, side: str = "right") -> Float[Tensor, " T"]:
-    """Return the share of an arm's area in the image that no other limb covers, by the true states.
+def visible_share(tracked: BendPerson, view: View) -> Float[Tensor, " T"]:
+    """Return the share of the right arm's area in the image that no other limb covers, by the true states.
 
     |arm without rest| / |arm|: where it is small a silhouette says nothing about the arm.
     """
     limbs = tracked.body.limbs(fit_state(tracked.body, view.clip.joints))
-    arm = [i for i, name in enumerate(_LIMBS) if name in (f"{side}_upper_arm", f"{side}_forearm")]
+    arm = [i for i, name in enumerate(_LIMBS) if name in ("right_upper_arm", "right_forearm")]
     rest = [i for i in range(len(_LIMBS)) if i not in arm]
     height, width = view.silhouettes.shape[-2:]
     drawn = [

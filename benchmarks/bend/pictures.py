@@ -41,11 +41,11 @@ _SEEN = (0.80, 0.84, 0.89)
 _BONES = [(i, parent) for i, parent in enumerate(BODY_15.parents) if parent >= 0]
 
 
-def plot_particles(runs: Results, title: str = "Error over the number of particles") -> Figure:
+def plot_particles(runs: Results) -> Figure:
     """Draw Figure 3 in kind: mean squared error of the angles, then root and joints, over N.
 
     Args:
-        runs: by number of particles, such as "1,000". title: above.
+        runs: by number of particles, such as "1,000".
     """
     return plot_by_condition(
         runs,
@@ -54,23 +54,20 @@ def plot_particles(runs: Results, title: str = "Error over the number of particl
             "error of the root (mm)": root_error,
             "error of the joints (mm)": JOINT_ERROR,
         },
-        title,
+        "Error over the number of particles",
         places=[int(name.replace(",", "")) for name in runs.names("condition")],
         axis="particles",
     )
 
 
 @torch.no_grad()
-def predictions(
-    tracker: SilhouetteParticleFilter, view: View, frame: int, count: int, seed: int = 0
-) -> Tensor:
+def predictions(tracker: SilhouetteParticleFilter, view: View, frame: int, count: int) -> Tensor:
     """Return joints [count, 15, 3] of randomly chosen particles as predicted for a frame, before weighting.
 
     Args:
         tracker: run up to the frame. view: what it sees. frame: counted from 0. count: how many.
-        seed: of the filter and of the choice.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     state = tracker.init(view.initial_state[None], generator=generator)
     with warnings.catch_warnings():  # of frames in which every particle was clamped
         warnings.simplefilter("ignore", DegenerateFilterWarning)

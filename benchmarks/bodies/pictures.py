@@ -76,20 +76,18 @@ def plot_errors_by_time(
     return figure
 
 
-def plot_errors_by_part(
-    runs: Results, label: Callable[[str], str] = str, title: str = "Error by part of the body"
-) -> Figure:
+def plot_errors_by_part(runs: Results, label: Callable[[str], str] = str) -> Figure:
     """Draw the mean error of the whole body and of every part, one bar a method, with its spread.
 
     Args:
-        runs: of one condition. label: what a method is called. title: above.
+        runs: of one condition. label: what a method is called.
     """
     require_matplotlib()
     from matplotlib.patches import Patch
 
     styles = method_styles([label(method) for method in runs.names("method")])
     parts = ("", *PARTS)
-    figure = new_figure(7.6, 3.8, title)
+    figure = new_figure(7.6, 3.8, "Error by part of the body")
     ax = style_axes(figure.add_subplot(), y="error (mm)")
     ax.grid(False, axis="x")
     width = 0.8 / len(styles)
@@ -110,8 +108,8 @@ def plot_errors_by_part(
 def plot_silhouettes(
     subject: Subject[Any],
     runs: Sequence[tuple[str, Run]],
-    n_frames: int = 4,
-    title: str | None = None,
+    n_frames: int,
+    title: str,
 ) -> Figure:
     """Draw the observed silhouettes, and the estimated bodies over them.
 

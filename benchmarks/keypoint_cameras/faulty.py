@@ -115,14 +115,11 @@ WAYS: Mapping[str, Way] = {
 }
 
 
-def add_faulty_cameras(
-    report: Report, clips: Sequence[Clip], rigs: Sequence[int], cases: Sequence[str] = tuple(CASES)
-) -> None:
+def add_faulty_cameras(report: Report, clips: Sequence[Clip], rigs: Sequence[int]) -> None:
     """Add a table of each number of cameras.
 
     Args:
         report: to which they are added. clips: of recorded bodies. rigs: numbers of cameras, 3 or more.
-        cases: names of rows.
     """
     columns = [f"{way}{what}" for way in WAYS for what in ("", ", worst")]
     for count in rigs:
@@ -130,7 +127,7 @@ def add_faulty_cameras(
         note = _NOTE.format(len(clips), FRAMES)
         table = report.table(title, title, columns, digits=(1,) * len(columns), note=note)
         chosen = [begun(clip.of_cameras(count), FRAMES) for clip in clips]
-        for name in tqdm(cases, desc=title):
+        for name in tqdm(CASES, desc=title):
             seen = [CASES[name](clip) for clip in chosen]
             cells: list[float] = []
             for way in WAYS.values():

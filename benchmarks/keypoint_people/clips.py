@@ -94,21 +94,14 @@ class People(NamedTuple):
         )
 
 
-def meet(
-    data: Path,
-    names: Sequence[str],
-    seed: int = 0,
-    faults: Faults = FAULTS,
-    frames: int = FRAMES,
-) -> People:
+def meet(data: Path, names: Sequence[str], seed: int, frames: int = FRAMES) -> People:
     """Return walkers who pass each other, as cameras see them.
 
     Args:
-        data: folder with the sets. names: the recordings. seed: of cameras and faults. faults: of the
-            detector. frames: at most.
+        data: folder with the sets. names: the recordings. seed: of cameras and faults. frames: at most.
     """
     clips = [next(recorded(data / WALKS, [name], frames)) for name in names]
-    return let_pass(clips, seed, faults)
+    return let_pass(clips, seed)
 
 
 def let_pass(clips: Sequence[MocapClip], seed: int = 0, faults: Faults = FAULTS) -> People:

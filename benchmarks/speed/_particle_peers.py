@@ -34,9 +34,9 @@ def component_log_density(x: np.ndarray, means: np.ndarray, factors: np.ndarray)
     return out - 0.5 * DIM * math.log(2 * math.pi)
 
 
-def log_sum_exp(a: np.ndarray, axis: int = -1) -> np.ndarray:
-    top = a.max(axis, keepdims=True)
-    return np.log(np.exp(a - top).sum(axis)) + top.squeeze(axis)
+def log_sum_exp(a: np.ndarray) -> np.ndarray:
+    top = a.max(-1, keepdims=True)
+    return np.log(np.exp(a - top).sum(-1)) + top.squeeze(-1)
 
 
 def systematic(weights: np.ndarray, u: float) -> np.ndarray:

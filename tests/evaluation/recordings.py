@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from torchpose.demo import performer
+from torchpose.evaluation._unseen import poses_by_rate
 from torchpose.learning import fit_upper_body_prior
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
@@ -34,6 +35,12 @@ def write_people(
                 source="example/people@0:x",
             )  # fmt: skip
     return folder
+
+
+def poses_to_score(recordings, prior, train, name=""):
+    """All sequences that are scored, [T, 8, 3] each."""
+    by_rate = poses_by_rate(recordings, prior, train, name)
+    return [sequence for own in by_rate.values() for sequence in own]
 
 
 def _v1_joint(name, named, neck):

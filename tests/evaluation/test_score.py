@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.evaluation.recordings import small_recipe, write_people
+from tests.evaluation.recordings import poses_to_score, small_recipe, write_people
 from torchpose.camera import PinholeCamera
 from torchpose.cli import _evaluate as evaluate
 from torchpose.errors import InputError, OverlapError
 from torchpose.evaluation import _score as score
 from torchpose.evaluation._trials import CAMERA, MEASURED, make_test_set, track
-from torchpose.evaluation._unseen import poses_to_score
 from torchpose.io import read_recordings
 from torchpose.metrics import align
 from torchpose.priors import load_prior

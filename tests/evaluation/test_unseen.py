@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.evaluation.recordings import poses, small_recipe, write_one, write_people
+from tests.evaluation.recordings import poses, poses_to_score, small_recipe, write_one, write_people
 from torchpose.camera import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.evaluation import _person_recordings as persons_module
@@ -49,7 +49,7 @@ def test_persons_are_told_apart_and_in_order(persons, tmp_path):
 
 
 def test_scores_are_those_of_tracker_and_metrics(persons, prior):
-    sequences = unseen.poses_to_score(persons["s10"], prior, persons["s1"])
+    sequences = poses_to_score(persons["s10"], prior, persons["s1"])
     found = unseen.score_person(prior, sequences, 30.0, unseen.ScoreSettings(seed=2))
     test = make_test_set(sequences, CAMERA, 30.0, 2)
     expected = joint_errors_3d(track(prior, CAMERA, test).joints3d, test.truth3d)
@@ -71,7 +71,7 @@ def test_sequences_are_tracked_at_their_own_rates(persons, prior, tmp_path):
     job = unseen.Job("s10", known, {"s10": both}, {"seed": 0, "n_components": 2}, small_recipe)
     (found,) = unseen.run_jobs([job], tmp_path)
     fitted = small_recipe(known, 2)
-    sequences = unseen.poses_to_score([slow], fitted, known)
+    sequences = poses_to_score([slow], fitted, known)
     apart = [unseen.score_person(fitted, sequences, rate, job.test) for rate in (30.0, 60.0)]
     torch.testing.assert_close(found["s10"].filtered, torch.cat([one.filtered for one in apart]))
     assert not apart[0].filtered.equal(apart[1].filtered)
@@ -79,7 +79,7 @@ def test_sequences_are_tracked_at_their_own_rates(persons, prior, tmp_path):
 
 def test_a_joint_that_does_not_count_changes_nothing(persons, prior):
     settings = unseen.ScoreSettings(unmeasured=("head",), unscored=("head",), likelihood=False)
-    sequences = unseen.poses_to_score(persons["s10"], prior, persons["s1"])
+    sequences = poses_to_score(persons["s10"], prior, persons["s1"])
     moved = [s.clone() for s in sequences]
     for s in moved:
         s[:, UPPER_BODY.index("head")] += 0.05
@@ -148,11 +148,11 @@ def test_sequences_are_cut_where_joints_are_missing(persons, prior):
     (recording,) = persons["s10"]
     joints = recording.joints.clone()
     joints[12, recording.names.index("left_hand")] = torch.nan
-    pieces = unseen.poses_to_score([replace(recording, joints=joints)], prior, persons["s1"])
+    pieces = poses_to_score([replace(recording, joints=joints)], prior, persons["s1"])
     assert [len(p) for p in pieces] == [12, 17]
     joints[::8] = torch.nan
     with pytest.raises(InputError, match="s10: no 10 frames in a row"):
-        unseen.poses_to_score([replace(recording, joints=joints)], prior, persons["s1"], "s10")
+        poses_to_score([replace(recording, joints=joints)], prior, persons["s1"], "s10")
 
 
 def test_necks_are_converted_and_wrists_refused(persons, prior, tmp_path):
@@ -161,7 +161,7 @@ def test_necks_are_converted_and_wrists_refused(persons, prior, tmp_path):
     joints[:, 4] = (joints[:, 2] + joints[:, 5]) / 2
     low = replace(other, joints=joints, skeleton="")
     assert low.upper_body().neck == "mid-shoulder"
-    (found,) = unseen.poses_to_score([low], prior, persons["s1"] + persons["s2"])
+    (found,) = poses_to_score([low], prior, persons["s1"] + persons["s2"])
     middle = (found[:, 2] + found[:, 5]) / 2
     gap = (found[:, 4] - middle).norm(dim=-1)
     own = torch.cat([r.upper_body().joints for r in persons["s1"] + persons["s2"]])
@@ -169,7 +169,7 @@ def test_necks_are_converted_and_wrists_refused(persons, prior, tmp_path):
     assert float(gap.mean()) == pytest.approx(float(wanted.mean()), abs=0.02)
     assert bool((found[:, 4] == 0).all())
     with pytest.raises(PriorError, match="wrists"):
-        unseen.poses_to_score([with_wrists(r) for r in persons["s10"]], prior, persons["s1"])
+        poses_to_score([with_wrists(r) for r in persons["s10"]], prior, persons["s1"])
 
 
 def test_what_arms_do():
@@ -194,7 +194,7 @@ def test_what_arms_do():
 def test_pooled_frames_and_spread(persons, prior):
     parts = [
         unseen.score_person(
-            prior, unseen.poses_to_score(group, prior, persons["s1"]), 30.0, unseen.ScoreSettings()
+            prior, poses_to_score(group, prior, persons["s1"]), 30.0, unseen.ScoreSettings()
         )
         for group in persons.values()
     ]

@@ -282,19 +282,6 @@ def log_likelihood(
 # --- test sequences -------------------------------------------------------------------------------
 
 
-def poses_to_score(
-    recordings: Sequence[Recording],
-    prior: UpperBodyPrior,
-    train: Sequence[Recording] | None,
-    name: str = "",
-) -> list[Float[Tensor, "T 8 3"]]:
-    """Return complete sequences with the prior's neck, centred on it.
-
-    As `poses_by_rate`, of all frame rates in the order of the recordings.
-    """
-    return [piece for own in _pieces(recordings, prior, train, name) for piece in own]
-
-
 def poses_by_rate(
     recordings: Sequence[Recording],
     prior: UpperBodyPrior,

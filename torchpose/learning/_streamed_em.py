@@ -178,7 +178,6 @@ def fit_streamed(
     max_iter: int = 200,
     tol: float = 1e-4,
     share: Share = ALONE,
-    progress: bool = False,
     **options: Unpack[StartOptions],
 ) -> GaussianMixture:
     """Fit a mixture to a source that may be larger than memory, by one process or by many.
@@ -192,7 +191,6 @@ def fit_streamed(
         max_iter: largest number of steps.
         tol: change of the mean log-likelihood at which to stop; 0 never stops early.
         share: of this process; every process calls this function and gets the mixture.
-        progress: show a bar.
         options: the options of `StreamedEM.start`.
 
     Returns:
@@ -202,7 +200,7 @@ def fit_streamed(
         InputError: as `StreamedEM.start` and `StreamedEM.accumulate`.
     """
     em = StreamedEM.start(source, n_components, seed, **options)
-    run_streamed(em, source, max_iter=max_iter, tol=tol, share=share, progress=progress)
+    run_streamed(em, source, max_iter=max_iter, tol=tol, share=share)
     return em.mixture()
 
 

@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -123,22 +123,16 @@ def process_cov(prior: UpperBodyPrior, side: str, method: str) -> Tensor:
     return _find_filter(method).noise.cov(prior, side)
 
 
-def noise_options(
-    prior: UpperBodyPrior,
-    side: str,
-    method: str,
-    fps: float | None,
-    options: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return the caller's options, and for the others the noise and transition of the prior.
+def noise_options(prior: UpperBodyPrior, side: str, method: str) -> dict[str, Any]:
+    """Return the noise and transition that a prior brings for a method over single poses, at its own rate.
 
     Args:
-        method: over single poses. prior, side, fps, options: as in `PoseFilter.arguments`.
+        prior, side: as in `PoseFilter.arguments`. method: one over single poses.
 
     Raises:
-        InputError: as `process_cov`, or process_cov for the transition "ou", which has no Q.
+        InputError: as `process_cov`.
     """
-    return _find_filter(method).arguments(prior, side, fps, options)
+    return _find_filter(method).arguments(prior, side, None)
 
 
 def check_options(method: str, options: Iterable[str]) -> None:

@@ -126,7 +126,7 @@ class TunableKalman(nn.Module):
         super().__init__()
         self._prior = [prior]  # in a list: its buffers are no parameters of this module
         self.weights_of_loss = (error, evidence, departure)
-        options = noise_options(prior, "left", "mkf-fixed", None)
+        options = noise_options(prior, "left", "mkf-fixed")
         process = options["process_cov"]
         self.process = Positive(process if process.ndim == 1 else process.diagonal())
         std = prior.noise.get("measurement_std", torch.tensor(3.0)).double().expand(5)

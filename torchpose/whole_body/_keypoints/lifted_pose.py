@@ -26,7 +26,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.known_person import length_of_legs
 from torchpose.whole_body._keypoints.lifting_network import (
     Lifted,
-    LiftingNetwork,
     lifting_features,
     shipped_lifting_network,
 )
@@ -70,7 +69,6 @@ class PoseLifter(nn.Module):
         rig: of one camera. fps: frames per second. motion: of the person, whose legs tell the size.
         up: "y" or "z", the axis of the world that points up, by which the image is turned upright; without
             it the camera is taken to be level.
-        network: that lifts; the shipped one by default.
     """
 
     def __init__(
@@ -79,10 +77,9 @@ class PoseLifter(nn.Module):
         fps: float,
         motion: BodyMotion,
         up: str | None = None,
-        network: LiftingNetwork | None = None,
     ) -> None:
         super().__init__()
-        self.network = copy.deepcopy(network or shipped_lifting_network())
+        self.network = copy.deepcopy(shipped_lifting_network())
         self.fps, self.up = fps, up
         self._given = (rig, motion)  # a tuple, so that their tensors are held once
 
