@@ -34,7 +34,7 @@ from torchpose.evaluation._cross_tables import Crossed, add_added, add_cross, pl
 from torchpose.evaluation._person_recordings import by_person, read_known_persons
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
-from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
@@ -162,31 +162,54 @@ def run(
         "mocap share": mocap_share, "threads": torch.get_num_threads(), "workers": workers,
     })  # fmt: skip
     thin = 8 if quick else 1
+
+    def scored(jobs: Sequence[Job]) -> list[dict[str, Scored]]:
+        return run_jobs(jobs, folder, workers, progress)
+
     if part != "added":
         sets = _alike(_crossed(read, tested, thin), seed)
-        found = run_jobs(_cross_jobs(sets, scoring, common), folder, workers, progress)
-        add_cross(report, dict(zip(sets.mean, found, strict=True)), sets.how)
-        if sets.completion is not None:
-            heads = f"heads of {', '.join(sets.how.completed)}"
-            _add_completion(report, {heads: sets.completion})
-        draw_picture(report, out, "cross-dataset.png", lambda: plot_cross(report, list(sets.mean)))
+        _report_cross(report, out, sets, scored(_cross_jobs(sets, scoring, common)))
     if part != "cross":
         left_out = _left_out(read, thin, seed, mocap_share)
-        keys = [(held, label) for held, one in left_out.items() for label in one.trains]
-        jobs = [
-            Job(", ".join(key), left_out[key[0]].trains[key[1]], left_out[key[0]].tests,
-                test=scoring, **common)
-            for key in keys
-        ]  # fmt: skip
-        found = run_jobs(jobs, folder, workers, progress)
-        frames = [sum(map(len, job.train)) for job in jobs]
-        scores = dict(zip(keys, found, strict=True))
-        add_added(report, scores, dict(zip(keys, frames, strict=True)))
-        completions = {f"without {held}": one.completion for held, one in left_out.items()}
-        _add_completion(report, completions)
+        jobs = _added_jobs(left_out, scoring, common)
+        _report_added(report, left_out, jobs, scored(list(jobs.values())))
     report.findings += read.notes
     report.save(out)
     return report
+
+
+def _report_cross(
+    report: Report, out: Path, sets: _Alike, found: Sequence[Mapping[str, Scored]]
+) -> None:
+    """Add what the first part found, and its picture."""
+    add_cross(report, dict(zip(sets.mean, found, strict=True)), sets.how)
+    if sets.completion is not None:
+        heads = f"heads of {', '.join(sets.how.completed)}"
+        _add_completion(report, {heads: sets.completion})
+    draw_picture(report, out, "cross-dataset.png", lambda: plot_cross(report, list(sets.mean)))
+
+
+def _added_jobs(
+    left_out: Mapping[str, _Held], scoring: ScoreSettings, common: Mapping[str, Any]
+) -> dict[tuple[str, str], Job]:
+    """Return the jobs of the second part, by the persons left out and the training set."""
+    return {
+        (held, label): Job(f"{held}, {label}", train, one.tests, test=scoring, **common)
+        for held, one in left_out.items()
+        for label, train in one.trains.items()
+    }
+
+
+def _report_added(
+    report: Report,
+    left_out: Mapping[str, _Held],
+    jobs: Mapping[tuple[str, str], Job],
+    found: Sequence[Mapping[str, Scored]],
+) -> None:
+    """Add what the second part found."""
+    frames = {key: sum(map(len, job.train)) for key, job in jobs.items()}
+    add_added(report, dict(zip(jobs, found, strict=True)), frames)
+    _add_completion(report, {f"without {held}": one.completion for held, one in left_out.items()})
 
 
 # --- data sets ------------------------------------------------------------------------------------
