@@ -24,6 +24,7 @@ from torchpose.upper_body import (
 from torchpose.upper_body._estimator import arm_joints
 from torchpose.upper_body._measured_joints import in_prior_pixels
 from torchpose.upper_body._picked import pick_joints
+from torchpose.upper_body._tracker_options import MethodOptions
 
 NAMES = list(KEYPOINT_NAMES)
 
@@ -180,6 +181,11 @@ def test_an_option_changes_the_poses_or_is_refused(prior, keypoints, method, val
             change = joints(**(beside | {name: value})) - (joints(**beside) if beside else plain)
             assert change.abs().max() > 1e-9, name
     assert set(method_options(method)) <= set(values)
+
+
+def test_editors_know_the_options_of_all_methods():
+    known = {name for method in METHODS for name in method_options(method)}
+    assert set(MethodOptions.__annotations__) == known
 
 
 def test_a_gamma_that_the_prior_brings_is_left_out_with_another_transition(prior, keypoints):

@@ -41,7 +41,7 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTr
 from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 from torchpose.whole_body._measured_keypoints import given_keypoints
-from torchpose.whole_body._particle_setup import set_up_particles
+from torchpose.whole_body._particle_follower import set_up_particles
 
 
 class BodyStream(NamedTuple):

@@ -1,8 +1,9 @@
-"""Begin and follow one person with a particle filter, through silhouettes, keypoints, or both."""
+"""Set up a particle filter; begin and follow one person with it, through silhouettes, keypoints, or both."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,11 +14,13 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_shape
 from torchpose._core.module_state import derived
 from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.filters._measurements import check_lengths
 from torchpose.whole_body._body_arguments import whole_length
-from torchpose.whole_body._body_track import BodyTrack, repeat_last
+from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
+from torchpose.whole_body._filter_table import LEARNT, METHODS, make_filter, rebased
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._first_pose import find_first_pose
@@ -30,6 +33,7 @@ from torchpose.whole_body._measured_keypoints import (
     observed_frames,
 )
 
+_HEIGHT = 1.75  # metres, of a person of unknown height
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 
 
@@ -204,3 +208,61 @@ def _masks(one: Observed) -> Tensor:
     if one.silhouettes is None:
         raise InputError("expected silhouettes, got none")
     return one.silhouettes
+
+
+# --- set-up ---------------------------------------------------------------------------------------
+
+
+def set_up_particles(
+    method: str,
+    rig: CameraRig,
+    given: Mapping[str, Any],
+    body: Body | str | Path | None,
+    height: float | None,
+    fps: float,
+    n_particles: int,
+    options: Mapping[str, Any],
+    noise: tuple[float | None, float | None],
+) -> ParticleFollower:
+    """Return the filter of a method with what finds its first pose.
+
+    Args:
+        method: among `METHODS`. rig: the cameras. given: models, names or files by kind.
+        options: of the filter. noise: of keypoints, metres and pixels.
+        body, height, fps, n_particles: as `BodyTracker`.
+    """
+    found = {kind: _model(kind, value, fps) for kind, value in given.items()}
+    models = {kind: model for kind, (model, _) in found.items()}
+    person = rebased(_person(body, _HEIGHT if height is None else height), "parent", None)
+    upright, tracked, learnt = _bodies(method, person, models)
+    particles = make_filter(method, tracked, learnt, fps, n_particles, options)
+    own = METHODS[method].needs == "manifold"  # then the filter holds it
+    manifold = None if own else models.get("manifold")
+    notes = tuple(note for _, note in found.values() if note)
+    start_body = (
+        None if upright is tracked else upright
+    )  # so that its tensors are in the state once
+    return ParticleFollower(method, particles, rig, fps, start_body, manifold, noise, notes)
+
+
+def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
+    """Return a model with its noise for a frame rate, and notes about it."""
+    model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
+    return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
+
+
+def _person(body: Body | str | Path | None, height: float) -> Body:
+    if isinstance(body, Body):
+        return body
+    return Body.of_height(BODY_15, height) if body is None else load_body(body)
+
+
+def _bodies(method: str, person: Body, models: dict[str, Any]) -> tuple[Body, Body, Any]:
+    """Return the body with which the first pose is found, the one that is tracked, and the method's model."""
+    upright, needs = person, METHODS[method].needs
+    if "manifold" in models:
+        upright = LEARNT["manifold"].body(person, models["manifold"])
+    if needs is None:
+        return upright, person, None
+    tracked = upright if needs == "manifold" else LEARNT[needs].body(person, models[needs])
+    return upright, tracked, models[needs]
