@@ -19,7 +19,7 @@ _MODULES = {
     "": "protocols=evaluation",
     "_core": (
         "io.estimates io.fields=reading io.files io.leftovers=files io.npz=reading io.reading "
-        "metric_arguments=arguments module_state priors.tensor_file value_checks"
+        "metric_arguments=value_pairs module_state priors.tensor_file value_checks"
     ),
     "body": "body.body_parameters=_limbs",
     "camera": (

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.arguments import as_pair
 from torchpose._core.checks import check_choice, check_shape
 from torchpose._core.module_state import outside_inference
+from torchpose._core.value_pairs import as_pair
 from torchpose.math._gaussian import safe_eigh
 
 RotationOrder = Literal["zxy", "zyx"]

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.arguments import as_pair, as_values
 from torchpose._core.checks import check_shape
+from torchpose._core.value_pairs import as_pair, as_values
 from torchpose.errors import InputError
 from torchpose.math._gaussian import log_prob, safe_cholesky
 

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.arguments import as_pair, as_values
 from torchpose._core.checks import check_shape
+from torchpose._core.value_pairs import as_pair, as_values
 from torchpose.errors import InputError
 from torchpose.math._rotations import RigidMotion, procrustes
 from torchpose.skeleton._torso import ALIGN_JOINTS

@@ -1,4 +1,4 @@
-"""Check arguments of metrics: estimates and truth of one shape and precision, boolean masks."""
+"""Check values that are compared, such as estimates and truth: one shape and precision, boolean masks."""
 
 from collections.abc import Sequence
 
