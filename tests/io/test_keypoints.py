@@ -342,6 +342,31 @@ def test_depths_and_times_of_tables_are_passed_over(tmp_path, lines, left_out):
     assert f"columns {left_out.replace('a_', 'head_')} are passed over" in note
 
 
+@pytest.mark.parametrize("stamp", ["2024-05-01T10:00:{:06.3f}", "00:00:{:06.3f}", "{}"])
+@pytest.mark.parametrize("frames", [(3, 4, 5, 6), (0, 2, 4, 8)])
+def test_time_stamps_give_the_rate(tmp_path, stamp, frames):
+    rows = [f"{stamp.format(f / 25)};{f};10,5;20" for f in frames]
+    read = read_keypoints(text(tmp_path, "timestamp;frame;head_x;head_y", *rows))
+    assert read.fps == pytest.approx(25.0) and read.keypoints[0].tolist() == [[10.5, 20.0]]
+    assert read.notes == ("time stamps taken for seconds: 25 frames per second",)
+    stated = read_keypoints(text(tmp_path, "# fps = 24", "timestamp;frame;head_x;head_y", *rows))
+    assert stated.fps == 24.0
+    rows = [row.replace(";", "@:;", 1) for row in rows]  # times of no known form are passed over
+    assert read_keypoints(text(tmp_path, "time;frame;head_x;head_y", *rows)).fps is None
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_decimal_commas_between_semicolons_or_tabs(tmp_path, mark):
+    lines = ["frame,head_x,head_y,neck_x,neck_y", "0,1.5,2.5,3.5,4.5", "1,5.5,6.5,,"]
+    plain = read_keypoints(text(tmp_path, *lines))
+    german = [line.replace(",", mark).replace(".", ",") for line in lines]
+    np.testing.assert_array_equal(
+        read_keypoints(text(tmp_path, *german)).keypoints, plain.keypoints
+    )
+    with pytest.raises(FileFormatError, match="decimal commas, separate cells by semicolons"):
+        read_keypoints(text(tmp_path, lines[0], lines[1].replace(".", ",")))
+
+
 def test_numbers_of_landmarks_are_mediapipes(tmp_path):
     rows = [f"0,{i},{0.3 + 0.01 * i},0.5,0,0.9" for i in range(33)]
     path = text(tmp_path, "# image_size = 1000,500", "frame,landmark,x,y,z,visibility", *rows)

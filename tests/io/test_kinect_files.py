@@ -225,7 +225,7 @@ def test_rows_of_single_joints_are_refused(tmp_path):
     ("text", "word"),
     [
         ("1 2 3 4 5\n", "rows of 60, 61"),
-        ("frame,head_x,head_y\n0,1,2\n", "got 3 cells"),
+        ("frame,head_x,head_y\n0,1,2\n", "a header with NAME_x.*got frame, head_x, head_y"),
         (rows_text(person(V1, 2)).rsplit(" ", 3)[0], "line 2: expected 60 numbers.*got 57"),
         (rows_text(person(V1, 2)).replace("0", "o", 1), "line 1: expected numbers"),
     ],
@@ -391,6 +391,80 @@ def test_time_columns_of_a_table(tmp_path, name, second):
     path = table(tmp_path / "a.csv", [i * second / 20 for i in range(5)], name)
     [found] = read_recordings(path)
     assert found.fps == pytest.approx(20.0) and not any("not used" in n for n in found.notes)
+
+
+def iso_stamps(n_frames):
+    return [f"2024-05-01T10:00:{i / 20:09.6f}" for i in range(n_frames)]
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        lambda stamp: stamp,
+        lambda stamp: stamp.replace("T", " ") + "0+02:00",  # seven digits, as .NET writes them
+        lambda stamp: stamp[:23] + "Z",
+        lambda stamp: stamp[11:],  # the time of the day alone
+    ],
+)
+def test_time_stamps_of_iso_8601(tmp_path, shown):
+    stamps = [shown(stamp) for stamp in iso_stamps(5)]
+    [found] = read_recordings(table(tmp_path / "a.csv", stamps, "Timestamp"))
+    assert found.fps == pytest.approx(20.0, rel=1e-5)
+    [found] = read_recordings(table(tmp_path / "b.csv", stamps, separator=";", decimal=","))
+    assert found.fps == pytest.approx(20.0, rel=1e-5)
+    with pytest.raises(FileFormatError, match=r"line 4: .*'noon' to a number or a time as 2024-"):
+        read_recordings(table(tmp_path / "c.csv", [*stamps[:1], "noon"]))
+
+
+@pytest.mark.parametrize("numbers", [3, 4])
+def test_time_stamps_of_iso_8601_before_rows(tmp_path, numbers):
+    joints = to_kinect(person(V2, 5))
+    states = np.full((5, 25, numbers - 3), 2.0)
+    rows = np.concatenate([joints, states], -1).reshape(5, -1)
+    lines = [",".join([stamp, *map(repr, row)])
+             for stamp, row in zip(iso_stamps(5), rows.tolist(), strict=True)]  # fmt: skip
+    path = write(tmp_path, "a.csv", "\n".join(lines))
+    [found] = read_recordings(path.parent)
+    assert found.fps == pytest.approx(20.0)
+    np.testing.assert_allclose(to_kinect(found.joints.numpy()), joints)
+
+
+def test_rows_of_several_bodies_without_a_column_that_tells(tmp_path):
+    joints = to_kinect(np.stack([person(V2, 3), person(V2, 3, seed=1)], 1).reshape(6, 25, 3))
+    for name, stamps in (("frame", [0, 0, 1, 1, 2, 2]), ("time", [0, 0, 0.1, 0.1, 0.2, 0.2])):
+        path = write(tmp_path, "a.csv", header_text(joints, V2, {name: stamps}))
+        with pytest.raises(FileFormatError, match=f"line 3: the {name} 0 is there twice.*body_id"):
+            read_recording(path)
+    text = header_text(joints, V2, {"frame": [0, 0, 1, 1, 2, 2], "player": [1, 2] * 3})
+    assert len(read_recording(write(tmp_path, "a.csv", text))) == 2
+
+
+def test_words_of_sensors_for_how_far_to_trust(tmp_path):
+    joints = to_kinect(person(V2, 3))
+    levels = np.array([0.0, 1.0, 2.0])[:, None].repeat(25, 1)
+    joints[0, 0] = np.nan
+    text = header_text(joints, V2, state=("tracking_state", levels))
+    plain = read_recording(write(tmp_path, "a.csv", text))[0].weights
+    words = ("NotTracked", "Inferred", "Tracked")
+    azure = [f"K4ABT_JOINT_CONFIDENCE_{word}" for word in ("NONE", "LOW", "MEDIUM")]
+    for kind, shown in (
+        ("tracking_state", words), ("confidence", azure), ("confidence", range(3))
+    ):  # fmt: skip
+        head, *rows = header_text(joints, V2, state=("state", levels)).splitlines()
+        rows = [",".join(str(shown[i]) if c % 4 == 3 else cell
+                         for c, cell in enumerate(row.split(",")))
+                for i, row in enumerate(rows)]  # fmt: skip
+        text = "\n".join([head.replace("_state", f"_{kind}"), *rows])
+        found = read_recording(write(tmp_path, "a.csv", text))[0].weights
+        assert found.unique().tolist() == [0.0, 0.5, 1.0] and found.equal(plain)
+
+
+def test_quoted_cells_and_units_beside_names(tmp_path):
+    joints = to_kinect(person(V2, 3))
+    text = header_text(1000 * joints, V2).replace("_x,", "_x [mm],").replace(",", '","')
+    text = "\n".join(f'"{line}"' for line in text.splitlines())
+    [found] = read_recording(write(tmp_path, "a.csv", text))
+    np.testing.assert_allclose(to_kinect(found.joints.numpy()), joints, atol=1e-6)
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])

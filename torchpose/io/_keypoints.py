@@ -113,7 +113,8 @@ def read_keypoints(path: str | Path, image_size: tuple[int, int] | None = None) 
     long form ``frame,name,x,y[,confidence]`` with a row per keypoint. Empty cells and absent frames
     are missing. Lines ``# fps = 30`` and ``# image_size = 640,480`` may stand above the header.
 
-    In both, `visibility` is the confidence where there is none. Columns of z and of times are passed over,
+    In both, `visibility` is the confidence where there is none. A column of times gives the rate where no
+    line states it. Cells may be separated by semicolons or tabs. Columns of z are passed over,
     and a note says so. Frames, names and scores may be called otherwise, as MediaPipe's scripts do.
 
     Keypoints that are shares of the image, from 0 to 1, are multiplied by its size where this is known.

@@ -25,7 +25,7 @@ from torchpose.io._formats.axes import (
     default_axes,
     heading,
 )
-from torchpose.io._formats.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
+from torchpose.io._formats.kinect_csv import ROW_LENGTHS, header_joints, is_row, read_kinect_csv
 from torchpose.io._formats.mocap_files import read_bvh, read_c3d
 from torchpose.io._formats.raw_recording import (
     RawRecording,
@@ -34,6 +34,7 @@ from torchpose.io._formats.raw_recording import (
     read_opencv_recording,
 )
 from torchpose.io._formats.skeleton_files import read_azure_json, read_kinect_v1, read_ntu_skeleton
+from torchpose.io._formats.table_rows import split_row
 from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._upper_body import UpperBody, to_upper_body
 
@@ -284,14 +285,6 @@ def _may_hold_joints(path: Path) -> bool:
         return True  # reading it gives the error
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell or "nan")
-    except ValueError:
-        return False
-    return True
-
-
 def looks_recorded(path: Path) -> bool:
     """Return whether a file that is no .npz begins as recordings of 3D joints do.
 
@@ -305,7 +298,7 @@ def looks_recorded(path: Path) -> bool:
         lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
         first = split_row(lines[0]) if lines else []
         daily = suffix == ".txt" and first[1:] == ["20"]
-        row = len(first) in ROW_LENGTHS and all(map(_is_number, first))
+        row = len(first) in ROW_LENGTHS and is_row(lines[0])
         return row or daily or (bool(lines) and bool(header_joints(lines[0])))
     if suffix == ".json":
         return '"joint_positions"' in start or '"bone_list"' in start

@@ -19,6 +19,7 @@ from torchpose._core.reading import (
 from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
+from torchpose.io._formats.table_rows import frame_rate, is_time, split_row, split_rows, stamp_of
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _SHOWN = 3  # columns that a message lists
@@ -28,7 +29,6 @@ FRAME_COLUMNS = ("frame", "frame_number", "frame_index", "frame_idx", "frame_id"
 """What the column of the frame is called, in small letters."""
 _NAMES = ("name", "keypoint", "landmark", "joint", "bodypart")
 _PASSED_OVER = ("z", "presence")  # beside x and y; MediaPipe's depth is no measurement
-_TIMES = ("time", "timestamp", "timestamp_ms", "time_s", "frame_time")
 _DEEPLABCUT = {"scorer", "individuals", "bodyparts", "coords"}  # first cells of its header
 _OF_SEVERAL_CAMERAS = {"point_id", "img_loc_x", "img_loc_y"}
 _NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
@@ -72,11 +72,11 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
     """Read a table with a row per frame or per keypoint; `read_keypoints` describes both."""
     lines = read_text(path, "comma-separated text").splitlines()
     notes = [line for line in lines if line.startswith("#")]
-    rows = [(number, [cell.strip() for cell in line.split(",")])
-            for number, line in enumerate(lines, start=1)
-            if line.strip() and not line.startswith("#")]  # fmt: skip
-    if not rows:
+    filled = [(number, line) for number, line in enumerate(lines, start=1)
+              if line.strip() and not line.startswith("#")]  # fmt: skip
+    if not filled:
         raise FileFormatError(f"{path}: expected a header frame,NAME_x,NAME_y,...; it is empty")
+    rows = split_rows(path, filled, len(split_row(filled[0][1])))
     rows = _from_deeplabcut(path, rows)
     header = [cell.lower() for cell in rows[0][1]]
     if set(header) >= _OF_SEVERAL_CAMERAS:
@@ -89,22 +89,20 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
             f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
             f"or frame,name,x,y[,confidence], got {','.join(rows[0][1])[:60]!r}"
         )
-    for number, cells in rows:
-        if len(cells) != len(header):
-            raise FileFormatError(
-                f"{path}, line {number}: expected {len(header)} cells as in the header, "
-                f"got {len(cells)}"
-            )
-    rows, left_out = _without_other_columns(rows)
+    rows, left_out, times = _without_other_columns(rows)
     header = rows[0][1]
     long = len(header) > 1 and header[1].lower() in _NAMES
     raw = _long_rows(path, header, rows[1:]) if long else _wide_rows(path, header, rows[1:])
     if any(column.lower().endswith("z") for column in left_out):
         _check_flat(path, raw.keypoints)
+    raw.fps, raw.image_size = _csv_notes(path, notes)
+    if raw.fps is None and times:
+        raw.fps, said = _rate_by_times(rows[1:], times[1:])
+        if raw.fps is not None:
+            raw.notes, left_out = (said,), [name for name in left_out if name != times[0]]
     if left_out:
         shown = first_of(left_out, _SHOWN)
-        raw.notes = (f"columns {shown} are passed over: x, y and a score of keypoints count",)
-    raw.fps, raw.image_size = _csv_notes(path, notes)
+        raw.notes += (f"columns {shown} are passed over: x, y and a score of keypoints count",)
     return raw
 
 
@@ -123,24 +121,41 @@ def _from_deeplabcut(path: Path, rows: _Rows) -> _Rows:
     return [(rows[0][0], header), *rows[len(lines.keys() & _DEEPLABCUT) :]]
 
 
-def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str]]:
-    """Return rows with the frame in front and without depths and times, and the names of these columns."""
+def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str], list[str]]:
+    """Return rows with the frame in front and without depths and times, names of these, and one of times.
+
+    The column of times is empty without one; its first cell is its name.
+    """
     header = rows[0][1]
     lower = [cell.lower() for cell in header]
     frame = next(lower.index(name) for name in FRAME_COLUMNS if name in lower)
     known = set(lower)
 
     def is_left_out(cell: str) -> bool:
-        if cell in _TIMES or (cell in _PASSED_OVER and {"x", "y"} <= known):
+        if is_time(cell) or (cell in _PASSED_OVER and {"x", "y"} <= known):
             return True
         name, _, kind = cell.rpartition("_")
         return kind in _PASSED_OVER and {f"{name}_x", f"{name}_y"} <= known
 
     left_out = [i for i, cell in enumerate(lower) if is_left_out(cell)]
     kept = [frame, *(i for i in range(len(header)) if i != frame and i not in left_out)]
-    return [(number, [cells[i] for i in kept]) for number, cells in rows], [
-        header[i] for i in left_out
-    ]
+    time = next((i for i in left_out if is_time(header[i])), None)
+    times = [] if time is None else [cells[time] for _, cells in rows]
+    return (
+        [(number, [cells[i] for i in kept]) for number, cells in rows],
+        [header[i] for i in left_out],
+        times,
+    )
+
+
+def _rate_by_times(rows: _Rows, times: list[str]) -> tuple[float | None, str]:
+    """Return the frames per second by the time stamps of rows of checked frames, and a note on them."""
+    try:
+        stamps = np.array([stamp_of(cell) for cell in times])
+    except ValueError:
+        return None, ""
+    frames, first = np.unique([float(cells[0]) for _, cells in rows], return_index=True)
+    return frame_rate(np.diff(stamps[first]) / np.diff(frames))
 
 
 def _check_flat(path: Path, points: np.ndarray) -> None:
@@ -164,8 +179,8 @@ def _wide_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
     if names and strange:
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],...; delete or rename "
-            f"{first_of(strange, _SHOWN)} (a score is NAME_confidence; no time is "
-            "read: write # fps = 30 above the header)"
+            f"{first_of(strange, _SHOWN)} (a score is NAME_confidence; write # fps = 30 "
+            "above the header, or call a column of time stamps time)"
         )
     if not names or absent or len(column) != len(header):
         raise FileFormatError(

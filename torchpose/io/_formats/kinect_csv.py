@@ -2,36 +2,49 @@
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from torchpose._core.reading import read_text
+from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError, SkeletonError
 from torchpose.io._formats.raw_recording import (
+    LEVEL_WEIGHTS,
     SENSOR_WEIGHTS,
     BodyFrame,
     RawRecording,
     frame_ranges,
     join_bodies,
 )
+from torchpose.io._formats.table_rows import (
+    FASTEST,
+    KINECT_FPS,
+    KINECT_TICK,
+    frame_rate,
+    is_time,
+    split_row,
+    split_rows,
+    stamp_of,
+)
 from torchpose.skeleton._joint_sets import SKELETONS, canonical_name
 
-KINECT_FPS = 30.0
-_KINECT_TICK = 1e-7  # Kinect v2's time stamps count 100 ns
-_TICKS = {
-    1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", _KINECT_TICK: "100 ns",
-    1e-9: "nanoseconds",
-}  # fmt: skip
 _GAP = 1.5  # median steps
-_RATES = (4.0, 250.0)  # frames per second that a recording may have
+_SHOWN = 3  # cells that a message lists
 _COLUMN = re.compile(
-    r"(?P<joint>.*?[a-z0-9])[ _.:/-]*(?P<what>x|y|z|state|tracking_?state|confidence)",
+    r"(?P<joint>.*?[a-z0-9])[ _.:/-]*(?P<what>x|y|z|state|tracking_?state|confidence)"
+    r"( *[\[(](m|cm|mm)[\])])?",  # the size of the body tells the unit
     re.IGNORECASE,
 )
-_TIMES = ("time", "time_s", "time_ms", "time_us", "timestamp", "timestamp_usec", "timestamp_ms")
-_BODIES = ("body", "body_id", "bodyid", "skeleton_id", "tracking_id", "trackingid", "user")
+_STATES = {
+    "nottracked": 0.0, "inferred": 1.0, "tracked": 2.0,  # Kinect v2
+    **{f"k4abt_joint_confidence_{word}": float(level)
+       for level, word in enumerate(("none", "low", "medium", "high"))},
+}  # fmt: skip
+_BODIES = ("body", "body_id", "bodyid", "skeleton_id", "tracking_id", "trackingid", "user",
+           "user_id", "userid", "player", "player_id")  # fmt: skip
 _PERSONS = ("person", "subject")
 
 
@@ -56,8 +69,9 @@ def read_kinect_csv(path: Path) -> list[RawRecording]:
     """Read a table with one row per frame, or one per frame and body.
 
     Without a header, the length of the rows says what they hold (`ROW_LENGTHS`). With one, the
-    columns are `NAME_x`, `NAME_y`, `NAME_z` and optionally `NAME_state` (0, 1, 2) or
-    `NAME_confidence` (0 to 1) of each joint, and optionally time, frame, body, and person. Lines with
+    columns are `NAME_x`, `NAME_y`, `NAME_z` and optionally `NAME_state` (0, 1, 2, or Kinect's words) or
+    `NAME_confidence` (0 to 1, or Azure's levels) of each joint, and optionally time, frame, body, and
+    person. Lines with
     ``#`` above may say `fps`, `axes`, `person`, `action` and `source`, as ``# fps = 30``.
 
     Raises:
@@ -69,21 +83,13 @@ def read_kinect_csv(path: Path) -> list[RawRecording]:
     rows = [(i, line) for i, line in rows if not line.lstrip().startswith("#")]
     if rows and header_joints(rows[0][1]):
         return _read_with_header(path, rows, facts)
+    if rows and not is_row(rows[0][1]):
+        raise FileFormatError(
+            f"{path}, line {rows[0][0]}: expected numbers, or a header with NAME_x, NAME_y and NAME_z of "
+            f"each joint (SpineBase_x, left_hand_x) above them, got "
+            f"{first_of(split_row(rows[0][1]), _SHOWN):.120}"
+        )
     return [_read_rows(path, rows, facts)]
-
-
-def split_row(line: str) -> list[str]:
-    """Return the cells of a row, at semicolons, tabs or commas, else at blanks.
-
-    Between semicolons or tabs a comma is the decimal mark.
-    """
-    line = line.strip()
-    for mark in (";", "\t", ","):
-        if mark in line:
-            line = line.removesuffix(mark)
-            line = line if mark == "," else re.sub(r"(?<=\d),(?=\d)", ".", line)
-            return [cell.strip() for cell in line.split(mark)]
-    return line.split()
 
 
 def header_joints(line: str) -> dict[str, dict[str, int]]:
@@ -98,21 +104,16 @@ def header_joints(line: str) -> dict[str, dict[str, int]]:
     return found if any({"x", "y", "z"} <= set(joint) for joint in found.values()) else {}
 
 
-def frame_rate(stamps: np.ndarray) -> tuple[float | None, str]:
-    """Return the frames per second by the median step of the stamps, and what they were taken for.
-
-    Of seconds, milliseconds, microseconds, 100 ns and nanoseconds, the one that comes nearest to 30
-    frames per second; None for steps that are none of them, such as numbers of frames.
-    """
-    steps = np.diff(stamps)
-    steps = steps[steps > 0]
-    if not len(steps):
-        return None, ""
-    rates = {name: 1 / (tick * float(np.median(steps))) for tick, name in _TICKS.items()}
-    name = min(rates, key=lambda name: abs(math.log(rates[name] / KINECT_FPS)))
-    if not _RATES[0] <= rates[name] <= _RATES[1]:
-        return None, ""
-    return rates[name], f"time stamps taken for {name}: {rates[name]:.3g} frames per second"
+def is_row(line: str) -> bool:
+    """Return whether a line holds numbers, the first of which may be a time stamp."""
+    try:
+        first, *others = split_row(line)
+        stamp_of(first)
+        for cell in others:
+            float(cell or "nan")
+    except ValueError:
+        return False
+    return True
 
 
 def dropped_frames(stamps: np.ndarray) -> list[str]:
@@ -144,12 +145,12 @@ def _read_rows(path: Path, rows: list[tuple[int, str]], facts: dict[str, str]) -
     if layout.numbers == 4:
         weights = _state_weights(values[..., 3], layout, notes)
     fps: float | None = KINECT_FPS
-    if stamps is not None and layout == ROW_LENGTHS[101]:
-        steps = np.diff(stamps) * _KINECT_TICK
+    if stamps is not None and layout == ROW_LENGTHS[101] and _are_ticks(stamps):
+        steps = np.diff(stamps) * KINECT_TICK
         fps = float(1 / np.median(steps)) if len(steps) else None
         notes += dropped_frames(stamps)
     elif stamps is not None:
-        found, note = frame_rate(stamps)
+        found, note = frame_rate(np.diff(stamps))
         fps = found or KINECT_FPS
         notes.append(note or "30 frames per second assumed: the first column holds no times")
     joints = values[..., :3]
@@ -160,6 +161,11 @@ def _read_rows(path: Path, rows: list[tuple[int, str]], facts: dict[str, str]) -
         person=facts.get("person", ""), action=facts.get("action", path.stem),
         source=facts.get("source", ""), weights=weights, notes=tuple(notes),
     )  # fmt: skip
+
+
+def _are_ticks(stamps: np.ndarray) -> bool:
+    """Return whether time stamps may count 100 ns, as Kinect's own do."""
+    return len(stamps) < 2 or KINECT_TICK * float(np.median(np.diff(stamps))) >= 1 / FASTEST
 
 
 def _layout(path: Path, rows: list[tuple[int, str]]) -> _Layout:
@@ -183,7 +189,8 @@ def _table(path: Path, rows: list[tuple[int, str]], layout: _Layout) -> np.ndarr
     table: list[list[float]] = []
     for number, line in rows:
         try:
-            row = [float(value) if value else math.nan for value in split_row(line)]
+            first, *others = split_row(line)
+            row = [stamp_of(first), *(float(cell) if cell else math.nan for cell in others)]
         except ValueError as error:
             raise FileFormatError(
                 f"{path}, line {number}: expected numbers, or a header with NAME_x, NAME_y and NAME_z of "
@@ -199,8 +206,8 @@ def _table(path: Path, rows: list[tuple[int, str]], layout: _Layout) -> np.ndarr
             raise FileFormatError(f"{path}, line {number}: tracking states must be 0, 1 or 2")
         if layout.stamped and table and row[0] <= table[-1][0]:
             raise FileFormatError(
-                f"{path}, line {number}: time stamps must increase, got {row[0]:.0f} after "
-                f"{table[-1][0]:.0f}"
+                f"{path}, line {number}: time stamps must increase, got {row[0]:.15g} after "
+                f"{table[-1][0]:.15g}"
             )
         table.append(row)
     return np.array(table).reshape(-1, width)
@@ -220,6 +227,16 @@ def _state_weights(states: np.ndarray, layout: _Layout, notes: list[str]) -> np.
 # --- with a header --------------------------------------------------------------------------------
 
 
+def _number(cell: str) -> float:
+    """Return the number of a cell, NaN if it is empty; words of tracking states have one."""
+    try:
+        return float(cell or math.nan)
+    except ValueError:
+        if cell.lower() not in _STATES:
+            raise
+        return _STATES[cell.lower()]
+
+
 def _read_with_header(
     path: Path, rows: list[tuple[int, str]], facts: dict[str, str]
 ) -> list[RawRecording]:
@@ -231,20 +248,18 @@ def _read_with_header(
             raise FileFormatError(
                 f"{path}: joint {joint} has the columns {', '.join(sorted(places))}; expected x, y, z"
             )
-    cells = _cells(path, rows[1:], len(header))
+    cells = split_rows(path, rows[1:], len(header))
     names = tuple(columns)
-    numbers = _to_numbers(
-        path, rows[1:], cells, sorted({c for j in columns.values() for c in j.values()})
-    )
+    numbers = _to_numbers(path, cells, sorted({c for j in columns.values() for c in j.values()}))
     joints = np.stack([numbers[:, [columns[n][axis] for axis in "xyz"]] for n in names], 1)
     weights = _column_weights(path, numbers, columns)
     notes: list[str] = []
-    time = next((header.index(name) for name in _TIMES if name in header), None)
+    time = next((column for column, name in enumerate(header) if is_time(name)), None)
     frame = header.index("frame") if "frame" in header else None
     fps = None
     if time is not None:
-        stamps = np.unique(_to_numbers(path, rows[1:], cells, [time])[:, time])
-        fps, note = frame_rate(stamps)
+        stamps = np.unique(_to_numbers(path, cells, [time], stamp_of)[:, time])
+        fps, note = frame_rate(np.diff(stamps))
         notes += [note, *dropped_frames(stamps)] if note else []
     known = {c for j in columns.values() for c in j.values()} | {time, frame}
     known |= {header.index(name) for name in (*_BODIES, *_PERSONS) if name in header}
@@ -258,45 +273,49 @@ def _read_with_header(
     }  # fmt: skip
     fps = _stated_rate(path, facts, fps)
     body = next((header.index(name) for name in _BODIES if name in header), None)
-    if body is None:
-        return [RawRecording(path, joints, names, fps, weights=weights, **common)]
     clock = frame if frame is not None else time
+    if body is None:
+        if clock is not None:
+            _check_one_body(path, header[clock], cells, clock)
+        return [RawRecording(path, joints, names, fps, weights=weights, **common)]
     if clock is None:
         raise FileFormatError(
             f"{path}: a table with a column {header[body]!r} needs a column 'frame' or 'time'"
         )
-    _, index = np.unique(_to_numbers(path, rows[1:], cells, [clock])[:, clock], return_inverse=True)
+    _, index = np.unique(_to_numbers(path, cells, [clock], stamp_of)[:, clock], return_inverse=True)
     frames = [
-        BodyFrame(int(t), cells[i][body], joints[i], None if weights is None else weights[i])
+        BodyFrame(int(t), cells[i][1][body], joints[i], None if weights is None else weights[i])
         for i, t in enumerate(index.tolist())
     ]
     return join_bodies(path, frames, int(index.max(initial=-1)) + 1, names, fps, **common)
 
 
-def _cells(path: Path, rows: list[tuple[int, str]], width: int) -> list[list[str]]:
-    cells = []
-    for number, line in rows:
-        row = split_row(line)
-        row += [""] * (width - len(row) if line.strip().endswith((",", ";", "\t")) else 0)
-        if len(row) != width:
-            raise FileFormatError(
-                f"{path}, line {number}: expected {width} cells as in the header, got {len(row)}"
-            )
-        cells.append(row)
-    return cells
-
-
 def _to_numbers(
-    path: Path, rows: list[tuple[int, str]], cells: list[list[str]], columns: list[int]
+    path: Path,
+    rows: list[tuple[int, list[str]]],
+    columns: list[int],
+    number_of: Callable[[str], float] = _number,
 ) -> np.ndarray:
     """Return the columns as numbers [T, width], NaN for empty cells and for columns not asked for."""
-    table = np.full((len(cells), len(cells[0]) if cells else max(columns) + 1), np.nan)
-    for (number, _), row, values in zip(rows, cells, table, strict=True):
+    table = np.full((len(rows), len(rows[0][1]) if rows else max(columns) + 1), np.nan)
+    for (number, row), values in zip(rows, table, strict=True):
         try:
-            values[columns] = [float(row[c]) if row[c] else math.nan for c in columns]
+            values[columns] = [number_of(row[c]) for c in columns]
         except ValueError as error:
             raise FileFormatError(f"{path}, line {number}: expected numbers ({error})") from error
     return table
+
+
+def _check_one_body(path: Path, clock: str, rows: list[tuple[int, list[str]]], column: int) -> None:
+    """Raise unless every frame has one row, where no column tells bodies apart."""
+    before: set[str] = set()
+    for number, row in rows:
+        if row[column] and row[column] in before:
+            raise FileFormatError(
+                f"{path}, line {number}: the {clock} {row[column]} is there twice; if the rows are of "
+                f"several bodies, call the column that tells them apart body_id ({', '.join(_BODIES)})"
+            )
+        before.add(row[column])
 
 
 def _column_weights(
@@ -305,9 +324,15 @@ def _column_weights(
     if not any({"state", "confidence"} & set(places) for places in columns.values()):
         return None
     weights = np.ones((len(numbers), len(columns)))
+    scores = [places["confidence"] for places in columns.values() if "confidence" in places]
+    found = set(np.unique(np.nan_to_num(numbers[:, scores])))
+    are_levels = found <= {0.0, 1.0, 2.0, 3.0} and max(found, default=0.0) > 1
     for j, (joint, places) in enumerate(columns.items()):
         if "confidence" in places:
-            weights[:, j] = np.nan_to_num(numbers[:, places["confidence"]])
+            confidence = np.nan_to_num(numbers[:, places["confidence"]])
+            weights[:, j] = (
+                np.array(LEVEL_WEIGHTS)[confidence.astype(int)] if are_levels else confidence
+            )
         elif "state" in places:
             states = np.nan_to_num(numbers[:, places["state"]])
             if not set(np.unique(states)) <= {0.0, 1.0, 2.0}:
@@ -316,11 +341,11 @@ def _column_weights(
     return weights
 
 
-def _only_person(path: Path, header: list[str], cells: list[list[str]]) -> str:
+def _only_person(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> str:
     column = next((header.index(name) for name in _PERSONS if name in header), None)
     if column is None:
         return ""
-    found = sorted({row[column] for row in cells})
+    found = sorted({row[column] for _, row in rows})
     if len(found) > 1:
         raise FileFormatError(
             f"{path}: holds several persons ({', '.join(found[:4])}); write one file for each"

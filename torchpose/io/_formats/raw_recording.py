@@ -22,6 +22,8 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 
 SENSOR_WEIGHTS = (0.0, 0.5, 1.0)
 """Kinect's tracking states as weights: not tracked, inferred, tracked."""
+LEVEL_WEIGHTS = (0.0, 0.5, 1.0, 1.0)
+"""Azure Kinect's levels of confidence as weights: out of range, occluded (predicted), medium, high."""
 
 _SHOWN_RANGES = 4
 

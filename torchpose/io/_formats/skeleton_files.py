@@ -8,8 +8,15 @@ import numpy as np
 
 from torchpose._core.reading import read_json, read_text, reading
 from torchpose.errors import FileFormatError
-from torchpose.io._formats.kinect_csv import KINECT_FPS, dropped_frames, read_kinect_csv, split_row
-from torchpose.io._formats.raw_recording import SENSOR_WEIGHTS, BodyFrame, RawRecording, join_bodies
+from torchpose.io._formats.kinect_csv import dropped_frames, read_kinect_csv
+from torchpose.io._formats.raw_recording import (
+    LEVEL_WEIGHTS,
+    SENSOR_WEIGHTS,
+    BodyFrame,
+    RawRecording,
+    join_bodies,
+)
+from torchpose.io._formats.table_rows import KINECT_FPS, split_row
 from torchpose.skeleton._joint_sets import SKELETONS
 
 _KINECT_V1_NAMES = SKELETONS["kinect-v1-20"].joints
@@ -161,7 +168,6 @@ def _read_joint(reader: _Lines, frame: int, name: str) -> list[float]:
 
 
 _AZURE_NAMES = SKELETONS["azure-32"].joints
-_CONFIDENCE_WEIGHTS = (0.0, 0.5, 1.0, 1.0)  # out of range, occluded (predicted), medium, high
 _CONFIDENCE_KEYS = ("joint_confidence", "joint_confidences", "confidence_level",
                     "confidence_levels", "joint_confidence_levels")  # fmt: skip
 _MICROSECOND = 1e-6
@@ -215,7 +221,7 @@ def _read_body(path: Path, frame: int, body: Any, n_joints: int) -> BodyFrame:
         levels = _array(where, found[0], body[found[0]], (n_joints,))
         if not set(np.unique(levels)) <= {0.0, 1.0, 2.0, 3.0}:
             raise FileFormatError(f"{where}: confidence levels must be 0, 1, 2 or 3")
-        weights = np.array(_CONFIDENCE_WEIGHTS)[levels.astype(int)]
+        weights = np.array(LEVEL_WEIGHTS)[levels.astype(int)]
     return BodyFrame(frame, str(body["body_id"]), joints, weights)
 
 

@@ -1,0 +1,108 @@
+"""Split the rows of tables into cells, and read their time stamps."""
+
+import contextlib
+import datetime
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from torchpose.errors import FileFormatError
+
+KINECT_FPS = 30.0
+KINECT_TICK = 1e-7  # Kinect v2's time stamps count 100 ns
+_TICKS = {
+    1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", KINECT_TICK: "100 ns",
+    1e-9: "nanoseconds",
+}  # fmt: skip
+_SLOWEST, FASTEST = 4.0, 250.0  # frames per second that a recording may have
+_TIME = re.compile(
+    r"(date|frame|relative|elapsed)?_?time(_?stamp)?(_(s|sec|ms|us|usec|ns|iso|utc))?"
+)
+_MARKS = (";", "\t", ",")
+
+
+def split_row(line: str) -> list[str]:
+    """Return the cells of a row, at semicolons, tabs or commas, else at blanks.
+
+    Between semicolons or tabs a comma is the decimal mark. Quotation marks around cells are left out.
+    """
+    for mark in _MARKS:
+        if mark in line.strip():
+            line = line.lstrip().rstrip(" ").removesuffix(mark)  # tabs at the end are empty cells
+            line = line if mark == "," else re.sub(r"(?<=\d),(?=\d)", ".", line)
+            return [cell.strip().strip('"') for cell in line.split(mark)]
+    return [cell.strip('"') for cell in line.split()]
+
+
+def split_rows(path: Path, rows: list[tuple[int, str]], width: int) -> list[tuple[int, list[str]]]:
+    """Return the cells of rows, each with the number of its line.
+
+    Args:
+        path: for messages. rows: lines with their numbers. width: cells of the header, which rows may fall
+            short of where they end with marks.
+
+    Raises:
+        FileFormatError: a row of another number of cells.
+    """
+    cells = []
+    for number, line in rows:
+        row = split_row(line)
+        row += [""] * (width - len(row) if line.rstrip(" ").endswith(_MARKS) else 0)
+        if len(row) != width:
+            commas = len(row) > width and not set(_MARKS[:-1]) & set(line)
+            raise FileFormatError(
+                f"{path}, line {number}: expected {width} cells as in the header, got {len(row)}"
+                + "; with decimal commas, separate cells by semicolons or tabs" * commas
+            )
+        cells.append((number, row))
+    return cells
+
+
+def is_time(name: str) -> bool:
+    """Return whether a column of this name holds times.
+
+    >>> is_time("Timestamp (ms)"), is_time("time"), is_time("frame")
+    (True, True, False)
+    """
+    return _TIME.fullmatch(re.sub(r"\W+", "_", name).strip("_").lower()) is not None
+
+
+def stamp_of(cell: str) -> float:
+    """Return a time stamp as a number, NaN if the cell is empty.
+
+    A date with a time, or a time of the day, by ISO 8601 become seconds.
+
+    Raises:
+        ValueError: it is neither.
+
+    >>> stamp_of("1970-01-01T00:01:00.5"), stamp_of("00:01:00.5"), stamp_of("60.5")
+    (60.5, 60.5, 60.5)
+    """
+    with contextlib.suppress(ValueError):
+        return float(cell or math.nan)
+    text = cell if "-" in cell[:10] else f"1970-01-01T{cell}"
+    try:
+        time = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(
+            f"could not convert {cell!r:.40} to a number or a time as 2024-05-01T10:00:00.033"
+        ) from None
+    return (time if time.tzinfo else time.replace(tzinfo=datetime.UTC)).timestamp()
+
+
+def frame_rate(steps: np.ndarray) -> tuple[float | None, str]:
+    """Return the frames per second by the median step between time stamps, and a note on their unit.
+
+    Of seconds, milliseconds, microseconds, 100 ns and nanoseconds, the one that comes nearest to 30
+    frames per second; None for steps that are none of them, such as numbers of frames.
+    """
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None, ""
+    rates = {name: 1 / (tick * float(np.median(steps))) for tick, name in _TICKS.items()}
+    name = min(rates, key=lambda name: abs(math.log(rates[name] / KINECT_FPS)))
+    if not _SLOWEST <= rates[name] <= FASTEST:
+        return None, ""
+    return rates[name], f"time stamps taken for {name}: {rates[name]:.3g} frames per second"
