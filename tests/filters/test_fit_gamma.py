@@ -172,6 +172,7 @@ def test_the_filter_takes_it_and_explains_the_measurements_better(scene):
         ([torch.zeros(1, 3)], {}, InputError, "two consecutive frames"),
         ([torch.zeros(5, 3)], {"lengths": torch.tensor([3])}, InputError, "lengths"),
         (torch.zeros(1, 5, 3), {"lengths": torch.tensor([6])}, InputError, "from 1 to 5"),
+        (torch.zeros(1, 5, 3), {"lengths": torch.tensor([2.5])}, InputError, "integers from 1"),
         ([torch.zeros(5, 3)], {"subspace": 4}, InputError, "subspace"),
     ],
 )

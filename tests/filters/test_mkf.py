@@ -174,7 +174,7 @@ def test_many_mask_histories_fall_back_to_the_plain_loop_with_the_same_numbers()
 def test_a_batch_of_different_lengths_equals_single_calls(tracks):
     rng = np.random.default_rng(1)
     p = Problem(n_frames=90, batch=12, missing=0.02)
-    lengths = torch.tensor(rng.integers(1, 91, 12))
+    lengths = torch.tensor(rng.integers(1, 91, 12).astype(np.uint16))
     z, mask = tensor(p.z), torch.tensor(p.mask)
     model = p.filter(tracks=tracks)
     generators = [torch.Generator().manual_seed(b) for b in range(12)]

@@ -111,17 +111,19 @@ def test_every_method_runs_and_honours_generators(prior, scene, method):
     assert not track.log_evidence[1, 12:].nan_to_num().any()
 
 
-@pytest.mark.parametrize("lengths", [[0, 20], [20, 21], [20.0, 12.0]])
+@pytest.mark.parametrize("lengths", [[0, 20], [20, 21], [20.0, 12.0], [True, True]])
 def test_lengths_that_no_sequence_has_are_refused(prior, scene, lengths):
     batch = scene[1][None, :20].expand(2, -1, -1, -1)
     with pytest.raises(InputError, match="lengths must be integers from 1 to 20"):
         UpperBodyTracker(prior, demo_camera())(batch, names=NAMES, lengths=torch.tensor(lengths))
 
 
-def test_lengths_may_be_a_list(prior, scene):
+@pytest.mark.parametrize("kind", [list, np.uint8, np.uint16, np.uint64])
+def test_lengths_may_be_a_list_and_any_whole_numbers(prior, scene, kind):
     batch = scene[1][None, :20].expand(2, -1, -1, -1)
     tracker = UpperBodyTracker(prior, demo_camera(), "mkf-fixed")
-    found = tracker(batch, names=NAMES, lengths=[20, 12])
+    lengths = [20, 12] if kind is list else torch.as_tensor(np.array([20, 12], dtype=kind))
+    found = tracker(batch, names=NAMES, lengths=lengths)
     assert torch.equal(found.lengths, torch.tensor([20, 12]))
     with pytest.raises(InputError, match="number of frames of each sequence, got 'all'"):
         tracker(batch, names=NAMES, lengths="all")

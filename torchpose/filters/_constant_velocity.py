@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Integer
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_positive, check_shape
@@ -115,7 +115,7 @@ class ConstantVelocityFilter(nn.Module):
         return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
     def forward(
-        self, z: Float[Tensor, "B T N"], *, lengths: Int[Tensor, " B"] | None = None
+        self, z: Float[Tensor, "B T N"], *, lengths: Integer[Tensor, " B"] | None = None
     ) -> Float[Tensor, "B T N"]:
         """Return filtered numbers: each uses its own frame and those before.
 
@@ -147,7 +147,7 @@ class ConstantVelocityFilter(nn.Module):
         self,
         z: Float[Tensor, "B T N"],
         *,
-        lengths: Int[Tensor, " B"] | None = None,
+        lengths: Integer[Tensor, " B"] | None = None,
         lag: int | None = None,
     ) -> Float[Tensor, "B T N"]:
         """Return numbers that use later frames too.

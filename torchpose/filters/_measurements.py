@@ -93,11 +93,12 @@ def check_lengths(
         return torch.full((batch,), n_frames, device=device)
     lengths = torch.as_tensor(lengths, device=device)
     check_shape("lengths", lengths, [batch])
-    broken = lengths.dtype.is_floating_point or lengths.is_complex()
-    outside = torch.zeros_like(lengths) if broken else (lengths < 1) | (lengths > n_frames)
+    found = lengths.long()  # unsigned numbers of 16 bits and more cannot be compared
+    broken = lengths.dtype.is_floating_point or lengths.is_complex() or lengths.dtype == torch.bool
+    outside = (found < 1) | (found > n_frames)
     if broken or (values_visible() and bool(outside.any())):
         raise InputError(f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}")
-    return lengths.long()
+    return found
 
 
 def check_noise(measurement_cov: Tensor, z: Float[Tensor, "B T Z"]) -> Tensor:

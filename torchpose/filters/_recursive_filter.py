@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -270,7 +270,7 @@ class RecursiveFilter(WideModule, ABC):
         measurement_cov: Tensor | None = None,
         *,
         generator: Generators = None,
-        lengths: Int[Tensor, " B"] | None = None,
+        lengths: Integer[Tensor, " B"] | None = None,
         return_cov: bool = False,
         progress: bool = False,
     ) -> FilterOutput:
@@ -303,7 +303,7 @@ class RecursiveFilter(WideModule, ABC):
         mask: Bool[Tensor, "B T Z"] | None = None,
         measurement_cov: Tensor | None = None,
         *,
-        lengths: Int[Tensor, " B"] | None = None,
+        lengths: Integer[Tensor, " B"] | None = None,
         lag: int | None = None,
         return_cov: bool = False,
     ) -> FilterOutput:

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_finite, check_shape
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
+from torchpose.filters._measurements import check_lengths
 from torchpose.filters._weights import normalise
 from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -172,7 +173,7 @@ class _Pairs(NamedTuple):
 def fit_gamma(
     gmm: GaussianMixture,
     states: Float[Tensor, "B T D"] | Sequence[Float[Tensor, "T D"]],
-    lengths: Int[Tensor, " B"] | None = None,
+    lengths: Integer[Tensor, " B"] | None = None,
     *,
     shared: bool = False,
     subspace: int | None = None,
@@ -244,11 +245,7 @@ def _consecutive(
     if isinstance(states, Tensor):
         check_shape("states", states, ["B", "T", gmm.dim])
         count = states.shape[1]
-        if lengths is None:
-            lengths = torch.full((len(states),), count)
-        check_shape("lengths", lengths, [len(states)])
-        if bool(((lengths < 1) | (lengths > count)).any()):
-            raise InputError(f"lengths must be from 1 to {count}, got {lengths.tolist()}")
+        lengths = check_lengths(lengths, len(states), count, states.device)
         sequences = [x[:n] for x, n in zip(states, lengths.tolist(), strict=True)]
     else:
         if lengths is not None:

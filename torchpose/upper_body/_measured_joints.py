@@ -22,6 +22,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
 from torchpose.errors import InputError
+from torchpose.filters._measurements import check_lengths
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
@@ -342,11 +343,11 @@ def check_sequences(keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
     return keypoints
 
 
-def as_lengths(lengths: Tensor | Sequence[int]) -> Tensor:
-    """Return the numbers of frames of sequences as a tensor; `check_gaps` looks at their values.
+def as_lengths(lengths: Tensor | Sequence[int], batch: int, n_frames: int) -> Int[Tensor, " B"]:
+    """Return the numbers of frames of sequences as a tensor, on its own device.
 
     Raises:
-        InputError: what holds no real numbers.
+        ShapeError: not [B]. InputError: not whole numbers from 1 to T.
     """
     try:
         found = torch.as_tensor(lengths)
@@ -356,7 +357,7 @@ def as_lengths(lengths: Tensor | Sequence[int]) -> Tensor:
             "list of whole numbers"
         ) from error
     check_tensors(lengths=found)
-    return found
+    return check_lengths(found, batch, n_frames, found.device)
 
 
 def check_gaps(
@@ -378,11 +379,6 @@ def check_gaps(
     frames = torch.arange(n_frames, device=measured.device).expand(batch, -1)
     inside = torch.ones_like(frames, dtype=torch.bool)
     if lengths is not None:
-        check_shape("lengths", lengths, [batch])
-        if lengths.is_floating_point() or bool(((lengths < 1) | (lengths > n_frames)).any()):
-            raise InputError(
-                f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
-            )
         inside = frames < lengths.to(measured.device)[:, None]
     seen = measured.any(-1) & inside
     empty = torch.nonzero(~seen.any(1)).flatten().tolist()

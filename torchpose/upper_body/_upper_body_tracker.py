@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 
 from torchpose._core.checks import (
@@ -250,7 +250,7 @@ class UpperBodyTracker(WideModule):
         names: Sequence[str] | None = None,
         mask: Bool[Tensor, "B T J"] | None = None,
         generator: Generators = None,
-        lengths: Int[Tensor, " B"] | Sequence[int] | None = None,
+        lengths: Integer[Tensor, " B"] | Sequence[int] | None = None,
         progress: bool = False,
         covariance: Float[Tensor, "B T J 2 2"] | None = None,
         absent: Float[Tensor, "B T J"] | None = None,
@@ -290,7 +290,8 @@ class UpperBodyTracker(WideModule):
             check_tensors(keypoints=keypoints)
             keypoints = check_sequences(keypoints).to(self.measurement_cov)
             picked = self._pick(keypoints.shape[2], names)
-            lengths = None if lengths is None else as_lengths(lengths)
+            if lengths is not None:
+                lengths = as_lengths(lengths, *keypoints.shape[:2])
             given = self._measure(keypoints, confidence, mask, covariance, absent, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             there = given.mask.flatten(0, 1).any(0).tolist()

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from jaxtyping import Int
+from jaxtyping import Integer
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
@@ -66,7 +66,7 @@ def check_facing(facing: Any, initial_state: Any, keypoints: Any) -> None:
         refuse(["facing"] * (facing is not None), "where keypoints are given, which show it")
 
 
-def whole_length(lengths: Int[Tensor, "1"]) -> int:
+def whole_length(lengths: Integer[Tensor, "1"]) -> int:
     """Return how many frames of a sequence are tracked; `check_lengths` follows when all are counted."""
     check_shape("lengths", lengths, [1])
     if int(lengths) < 1:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self, Unpack, overload
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_rate, check_tensors
@@ -244,7 +244,7 @@ class BodyTracker(nn.Module):
         smoothing: str = "none",
         refine: str = "none",
         generator: torch.Generator | None = None,
-        lengths: Int[Tensor, "1"] | None = None,
+        lengths: Integer[Tensor, "1"] | None = None,
         facing: Float[Tensor, "3"] | None = None,
         n_frames: int | None = None,
         progress: bool = False,
