@@ -6,6 +6,7 @@ TORCHPOSE_SHAPE_CHECKS=0 switches the shape checks off, for profiling or a debug
 import gc
 import inspect
 import os
+import signal
 
 import pytest
 
@@ -46,6 +47,17 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _interruptible():
+    """Processes of tests hear Ctrl-C. A shell ignores it for commands in the background, and so would they."""
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @pytest.fixture(scope="session", autouse=True)
