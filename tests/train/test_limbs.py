@@ -115,6 +115,21 @@ def test_it_is_resumed_only_with_its_own_settings(scene, capsys) -> None:
     assert "settings least_std was 0.01, is 0.02" in capsys.readouterr().err
 
 
+def test_notes_tell_of_gaps(scene, capsys) -> None:
+    folder = scene.home / "gaps"
+    folder.mkdir()
+
+    def change(arrays):
+        arrays["joints"][10:12, 4] = np.nan
+        arrays["joints"][200:, 8] = np.nan
+
+    rewrite(write_trial(folder, "p6", 0), change)
+    assert run(scene, "gaps", "--data.held_out", "null", "--data.paths", f"['{folder}']") == 0
+    said = capsys.readouterr().out
+    assert "note: 2 frames with missing joints are interpolated, in gaps of up to 0.2 s" in said
+    assert "p6_0.npz: 40 of 240 frames are left out" in said
+
+
 def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     folders = {}
     for name, change in (("holes", make_hole), ("timeless", lambda arrays: arrays.pop("fps"))):
