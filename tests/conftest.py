@@ -51,7 +51,7 @@ def _one_thread():
 
 @pytest.fixture(scope="session", autouse=True)
 def _interruptible():
-    """Processes of tests hear Ctrl-C. A shell ignores it for commands in the background, and so would they."""
+    """Processes of tests hear Ctrl-C, which a shell ignores for commands in the background."""
     ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     if ignored:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -19,6 +19,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.files import check_output_folder, clear_leftovers
 from torchpose._core.terminal import one_line, show_progress
+from torchpose._core.wording import counted
 from torchpose.errors import InputError, OutputError, TorchposeError
 from torchpose.upper_body._keypoint_files import TrackSettings
 from train.predict_claims import Claim, Claims, Run
@@ -112,7 +113,9 @@ def process_rank(rank: int | None = None, world: int | None = None) -> tuple[int
         known = [pair for pair in _RANKS if all(name in os.environ for name in pair)]
         rank, world = (int(os.environ[name]) for name in known[0]) if known else (0, 1)
     if not 0 <= rank < world:
-        raise InputError(f"--rank must lie in 0..{world - 1} for {world} processes, got {rank}")
+        raise InputError(
+            f"--rank must lie in 0..{world - 1} for {counted(world, 'process', 'processes')}, got {rank}"
+        )
     return rank, world
 
 
@@ -213,7 +216,7 @@ class Batch(NamedTuple):
         if claim.deaths:
             clear_leftovers(result.parent)
         if claim.deaths >= _MOST_DEATHS and not self.retry_failed:
-            text = f"{claim.deaths} processes died at it, of memory perhaps"
+            text = f"{counted(claim.deaths, 'process', 'processes')} died at it, of memory perhaps"
             claim.record("failed", origin=origin, error=text, final=True, run=self.run.id)
             return Outcome(recording.name, "failed", error=text)
         claim.record("started", rank=self.rank, recording=recording.name)

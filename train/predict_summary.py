@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchpose._core.files import atomic_path
+from torchpose._core.wording import counted
 from torchpose.errors import OutputError
 
 __all__ = [
@@ -102,7 +103,7 @@ def count_outcomes(outcomes: Mapping[str, Outcome]) -> str:
     broken = sum(o.facts is not None and not o.good for o in outcomes.values())
     if broken:
         parts.append(f"in {broken} the filter degenerated (failed_at in the summary)")
-    return f"{len(outcomes) - states[OTHER]} recordings: {', '.join(parts)}"
+    return f"{counted(len(outcomes) - states[OTHER], 'recording')}: {', '.join(parts)}"
 
 
 def name_others(outcomes: Mapping[str, Outcome]) -> list[str]:

@@ -295,6 +295,6 @@ def test_gaps_leave_the_rest_of_a_recording(kind, torchpose, walks, tmp_path):
     out = tmp_path / "out" / "mine.safetensors"
     done = torchpose("fit", kind, tmp_path, "--out", out, *QUICK[kind])
     assert done.code == 0, done.err
-    assert "note: 1 frames with missing joints are interpolated" in done.out
+    assert "note: 1 frame with missing joints is interpolated" in done.out
     assert "p0_0.npz: 10 of 80 frames are left out" in done.out
     assert LOADERS[kind](out).info.persons == ("set#p0", "set#p1", "set#p2")

@@ -215,7 +215,7 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
         (["--n-particles", "19"], "must be at least 20 for method apf"),
         (["--conditionals", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--action", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
-        (["--delays", "[1,2]"], "one entry for each"),
+        (["--delays", "[1,2]"], "one for each camera, got 2"),
         (["--height", "-1"], "--height"),
         (["--height", "182"], "--height must lie between 0.5 and 2.6 m"),
         (["--camera-names", "[front,left]"], "a camera for each of the 3 inputs"),

@@ -606,8 +606,8 @@ def test_an_unknown_rate_is_said(track, tmp_path):
         ((*MIXED, "--method", "ekf"), "ekf"),
         ((*MIXED, "--detector", "a.onnx"), "all inputs are keypoints"),
         ((*MIXED, "--min-confidence", 0.5), "--min-confidence is for --detector"),
-        ((*MIXED, "--videos", "front.mp4"), "--videos needs one entry for each of the 3"),
-        ((*MIXED, "--delays", "[1]"), "--delays needs one entry for each of the 3"),
+        ((*MIXED, "--videos", "front.mp4"), "--videos needs 3 entries, one for each camera, got 1"),
+        ((*MIXED, "--delays", "[1]"), "--delays needs 3 entries, one for each camera, got 1"),
         ((*MIXED, "--formats", "fbx"), "--formats must be one of trc, c3d, bvh"),
         (
             ("front.mp4", "left.mp4", "behind.mp4", "--up", "z"),

@@ -146,7 +146,7 @@ def test_only_persons_whom_files_name_are_scored(tmp_path, monkeypatch):
     tests = {job.label: [len(r) for r in job.tests[job.label]] for job in ran}
     assert tests == {"alice": [30], "bob": [30]}
     assert [[r.person_id for r in job.train] for job in ran] == [["bob#"], ["alice#"]]
-    assert report.findings[-1].startswith("Other people in both.csv are left out (1 recordings)")
+    assert report.findings[-1].startswith("Other people in both.csv are left out (1 recording)")
     people = read_recordings(tmp_path / "bob")[0]
     one, other = (replace(people, person="s1", source=source) for source in "ab")
     assert list(persons_module.by_person([one, other])) == ["a#s1", "b#s1"]

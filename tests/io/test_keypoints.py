@@ -104,7 +104,7 @@ def test_zeros_are_missing(tmp_path):
     zeros[2, 1] = 0
     read = read_keypoints(write(tmp_path / "a.npz", keypoints=zeros))
     assert (~read.measured).nonzero().tolist() == [[2, 1]]
-    assert read.notes == ("1 keypoints at exactly (0, 0) or (-1, -1) count as missing",)
+    assert read.notes == ("1 keypoint at exactly (0, 0) or (-1, -1) counts as missing",)
     zeros[2, 1] = -1
     read = read_keypoints(write(tmp_path / "d.npz", keypoints=zeros))
     assert (~read.measured).nonzero().tolist() == [[2, 1]]

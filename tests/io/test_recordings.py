@@ -353,7 +353,7 @@ def test_every_set_reads(folder):
 @pytest.mark.data
 def test_frames_that_a_kinect_dropped_are_said():
     [wave] = read_recording(data_dir_or_skip("kinect_laban") / "Ges01_wavehand.csv")
-    assert wave.notes == ("2 frames are not in the file, by its time stamps: after 88, 95",)
+    assert wave.notes == ("frames that are not in the file, by its time stamps: 2, after 88, 95",)
 
 
 @pytest.mark.data

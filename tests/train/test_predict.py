@@ -278,7 +278,7 @@ def test_a_folder_with_a_file_that_is_no_recording_is_not_done(data, prior_file,
         (folder / f"bad{i}.csv").write_text("time,price\n0,1\n")
     assert main(arguments) == 1
     said = capsys.readouterr()
-    assert "1 recordings: 1 made before" in said.out
+    assert "1 recording: 1 made before" in said.out
     assert "bad4.csv: expected a first column frame, got time, price" in said.err
     assert "no recordings: 1 more files, which the summary lists" in said.err
     (folder / "a.npz").unlink()

@@ -1,4 +1,4 @@
-"""Word lists in messages."""
+"""Word lists and counts in messages."""
 
 from collections.abc import Sequence
 
@@ -11,3 +11,12 @@ def first_of(names: Sequence[object], most: int, between: str = ", ") -> str:
     """
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return between.join(map(str, names[:most])) + more
+
+
+def counted(count: int, one: str, several: str = "") -> str:
+    """Return a number of things, `one` of them or `several`, which is `one` with an s by default.
+
+    >>> counted(1, "camera"), counted(2, "camera"), counted(1, "frame is", "frames are")
+    ('1 camera', '2 cameras', '1 frame is')
+    """
+    return f"{count} {one if count == 1 else several or f'{one}s'}"

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_floating, check_shape
+from torchpose._core.wording import counted
 from torchpose.camera._lens import (
     OPENCV_DISTORTIONS,
     distort_rays,
@@ -224,7 +225,7 @@ class CameraRig(nn.Module):
         check_shape("points", points, ["...", "C", "N", 2])
         if points.shape[-3] != len(self):
             raise CameraError(
-                f"points must be of {len(self)} cameras ({', '.join(self.names)}), got "
+                f"points must be of {counted(len(self), 'camera')} ({', '.join(self.names)}), got "
                 f"{points.shape[-3]}"
             )
         if not is_distorted(self.distortions, any(self.fisheye)):
@@ -249,7 +250,7 @@ class CameraRig(nn.Module):
         count, height, width = shape[-3:]
         if count != len(self):
             raise CameraError(
-                f"{name} must be of {len(self)} cameras ({', '.join(self.names)}), got {count} "
+                f"{name} must be of {counted(len(self), 'camera')} ({', '.join(self.names)}), got {count} "
                 f"in shape {list(shape)}; rig.select([...]) keeps some of the cameras"
             )
         for camera, size in zip(self.names, self.sizes, strict=True):

@@ -5,6 +5,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from torchpose._core.wording import counted
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -93,7 +95,7 @@ def draw(
     if count == end:
         return files, ()
     return files, (
-        f"a video ends after {count} frames, so overlays do not show the poses after that",
+        f"a video ends after {counted(count, 'frame')}, so overlays do not show the poses after that",
     )
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from torchpose._core.terminal import show_progress
+from torchpose._core.wording import counted
 from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible
 from torchpose.cli._fit_bodies import KINDS
@@ -225,4 +226,7 @@ def _check_options(given: Given) -> None:
 def _count(recordings: list["Recording"]) -> str:
     persons = len({r.person_id for r in recordings})
     frames = sum(len(r) for r in recordings)
-    return f"{len(recordings)} recordings of {persons} persons, {frames} frames"
+    return (
+        f"{counted(len(recordings), 'recording')} of {counted(persons, 'person')}, "
+        f"{counted(frames, 'frame')}"
+    )

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torchpose._core.wording import first_of
+from torchpose._core.wording import counted, first_of
 
 Facts = dict[str, str]
 _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
@@ -176,8 +176,8 @@ def describe_body_poses(path: Path) -> Facts:
         "frames": f"{len(poses)} ({rate}) from frame {poses.first_frame}",
         "body": f"{poses.body.height:.2f} m, rotations against the "
         + ("root" if poses.body.frame == "body" else "part above"),
-        "unseen": f"{int(poses.coasting.sum())} frames" if bool(poses.coasting.any()) else "",
-        "lost": f"{int(poses.respread.sum())} frames" if bool(poses.respread.any()) else "",
+        "unseen": counted(int(poses.coasting.sum()), "frame") if bool(poses.coasting.any()) else "",
+        "lost": counted(int(poses.respread.sum()), "frame") if bool(poses.respread.any()) else "",
         "details": ", ".join(poses.details),
         "actions": action_text(poses),
         "std per axis (cm)": ", ".join(f"{name} {value:.1f}" for name, value in stds),

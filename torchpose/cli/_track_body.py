@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from torchpose._core.terminal import show_progress
+from torchpose._core.wording import counted
 from torchpose.cli._body_overlays import draw
 from torchpose.cli._body_recordings import Recordings, SilhouetteSettings
 from torchpose.cli._command import Command, Given
@@ -263,7 +264,7 @@ def _facts(
     exponent = tracker.filter.sharpness
     sharpness = "" if tracker.filter.sharpness_cancels else f", sharpness {exponent:g}"
     facts = {
-        "videos": f"{len(recordings.videos)} cameras, {recordings.fps:g} fps",
+        "videos": f"{counted(len(recordings.videos), 'camera')}, {recordings.fps:g} fps",
         "silhouettes": f"{width} x {height} pixels, "
         + ("against the empty scene" if recordings.background else "against what never changes"),
         "method": f"{tracker.method}, {tracker.n_particles} particles{sharpness}",

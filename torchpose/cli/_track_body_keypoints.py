@@ -10,6 +10,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchpose._core.terminal import show_progress
+from torchpose._core.wording import counted
 from torchpose.cli._body_keypoint_inputs import (
     BodyKeypoints,
     DetectorSettings,
@@ -269,7 +270,7 @@ def _facts(
             "actions": action_text(people[0]),
         }
     return {
-        "keypoints": f"{n_cameras} camera{'s' * (n_cameras > 1)}, {keypoints.fps:g} fps, by {source}",
+        "keypoints": f"{counted(n_cameras, 'camera')}, {keypoints.fps:g} fps, by {source}",
         "method": people[0].method
         + smoothing_text("full" if settings.smoothing == "full" else None),
         "body": _body_text(people, settings),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpose._core.checks import check_choice, check_height, check_positive
+from torchpose._core.wording import counted
 from torchpose.cli._command import Given
 from torchpose.cli._options import Option, options_of, options_of_methods
 from torchpose.cli._track import is_video
@@ -109,7 +110,8 @@ def check_values(values: dict[str, Any]) -> None:
         given = values[key]
         if given and len(given) != n_inputs:
             raise InputError(
-                f"--{key} needs one entry for each of the {n_inputs} cameras, got {len(given)}"
+                f"--{key} needs {counted(n_inputs, 'entry', 'entries')}, one for each camera, got "
+                f"{len(given)}"
             )
     for kind in values["formats"] or ():
         check_choice("--formats", kind, BODY_FORMATS)

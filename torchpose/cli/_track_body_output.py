@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from torchpose._core.wording import counted
 from torchpose.cli._body_overlays import overlay_name, span_of
 from torchpose.cli._track_output import person_suffix
 from torchpose.errors import DegenerateFilterWarning
@@ -197,9 +198,9 @@ def summary(
     coasting = sum(int(poses.coasting.sum()) for poses in people)
     respread = sum(int(poses.respread.sum()) for poses in people)
     if coasting:
-        print(f"{'unseen':<12} {coasting} frames, whose poses are predictions")
+        print(f"{'unseen':<12} {counted(coasting, 'frame')}, whose poses are predictions")
     if respread:
-        print(f"{'lost':<12} {respread} frames in which the search began anew")
+        print(f"{'lost':<12} {counted(respread, 'frame')} in which the search began anew")
     for note in (*_notes_of(people), *notes):
         print(f"{'note':<12} {note}")
     print(f"{'written':<12} " + ", ".join(map(str, written)))

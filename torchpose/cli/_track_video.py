@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpose._core.terminal import show_progress
+from torchpose._core.wording import counted
 from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cores
 from torchpose.cli._track_output import (
     TrackingJob,
@@ -376,7 +377,7 @@ def _nobody(
         what = "person"
         wants = f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
     print(
-        f"torchpose: no {what} was seen for half a second or longer in the {n_frames} frames "
+        f"torchpose: no {what} was seen for half a second or longer in the {counted(n_frames, 'frame')} "
         f"({n_frames / fps:.2g} s) of {where}, so there are no poses. {wants}",
         file=sys.stderr,
     )

@@ -12,6 +12,7 @@ import torch
 
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
+from torchpose._core.wording import counted
 from torchpose.errors import InputError
 from torchpose.evaluation._person_recordings import (
     POSE_CLASSES,
@@ -100,7 +101,7 @@ def run(
     scored = {name: result[name] for name, result in zip(persons, found, strict=True)}
     report = Report("Leave one person out", settings | {
         "quick": quick, "every": scoring.every, "recipe": recipe.__qualname__,
-        "persons": {name: f"{len(group)} recordings" for name, group in persons.items()},
+        "persons": {name: counted(len(group), "recording") for name, group in persons.items()},
         "threads": torch.get_num_threads(), "workers": workers,
     })  # fmt: skip
     table = add_persons(report, scored)

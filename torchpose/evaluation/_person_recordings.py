@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.wording import counted
 from torchpose.io._recordings import (
     BACK_TO_CAMERA,
     Recording,
@@ -74,8 +75,8 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
     others = [r for r in recordings if r.companion]
     files = sorted({r.path.name for r in others if r.path is not None})
     notes = [
-        f"Other people in {', '.join(files)} are left out ({len(others)} recordings): nobody says who "
-        "they are."
+        f"Other people in {', '.join(files)} are left out ({counted(len(others), 'recording')}): nobody "
+        "says who they are."
     ] * bool(others)
     doubts = [*same_names(known), *unstated_rates(known), *notes_on_unread_files(paths, found)]
     notes += [f"{note}." for note in doubts]

@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
+from torchpose._core.wording import counted
 from torchpose.errors import InputError, OverlapError
 from torchpose.evaluation._person_recordings import (
     by_person,
@@ -115,7 +116,7 @@ def run(
     report = Report("A prior and a tracker on recordings", {
         "prior": prior.info.name, "method": method or "default", "joints": joints, "seed": seed,
         "noise_std": noise_std, "every": every, "persons the prior was fitted on": known,
-        "persons": {name: f"{len(group)} recordings" for name, group in persons.items()},
+        "persons": {name: counted(len(group), "recording") for name, group in persons.items()},
     })  # fmt: skip
     _add_joints(report, found)
     by_name = {name: scores.scored for name, scores in found.items()}
@@ -257,7 +258,7 @@ def _add_findings(report: Report, found: Mapping[str, _PersonScores], known: Seq
     errors = [mean_error(scores.scored) for scores in found.values()]
     still = [100 * float(scores.baseline.double().nanmean()) for scores in found.values()]
     (mean, wide), (base, _) = spread(errors), spread(still)
-    persons = f"{len(found)} person{'s' * (len(found) != 1)}"
+    persons = counted(len(found), "person")
     deviation = f" ± {wide:.2f}" if len(found) > 1 else ""
     report.findings.append(
         f"Over {persons}: {mean:.2f}{deviation} cm filtered; the mean pose of the prior is "

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
+from torchpose._core.wording import counted
 from torchpose.errors import DegenerateFilterWarning
 
 
@@ -179,7 +180,7 @@ def _warn_of_failures(failed_at: Int[Tensor, "A B"]) -> None:
     failed = torch.nonzero(failed_at >= 0).reshape(-1).tolist()
     listed = ", ".join(f"element {b} at frame {int(failed_at[b])}" for b in failed[:8])
     warnings.warn(
-        f"{len(failed)} of {len(failed_at)} sequences degenerated ({listed}); "
+        f"{len(failed)} of {counted(len(failed_at), 'sequence')} degenerated ({listed}); "
         "their estimates are NaN from there on, the others finished. Check the scale of the "
         "measurements, or widen the measurement covariance",
         DegenerateFilterWarning,

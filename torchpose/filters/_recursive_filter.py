@@ -76,8 +76,7 @@ def check_generators(generator: Generators, batch: int) -> None:
     """Raise `InputError` for a list that does not hold one generator for each sequence."""
     if isinstance(generator, Sequence) and len(generator) != batch:
         raise InputError(
-            f"a list of generators must hold one for each of the {batch} sequences, "
-            f"got {len(generator)}"
+            f"a list of generators must hold {batch}, one for each sequence, got {len(generator)}"
         )
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchpose._core.checks import MOST_CONFIDENCE, check_pixels, check_rate
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
+from torchpose._core.wording import counted
 from torchpose.camera._projection import check_intrinsics
 from torchpose.errors import (
     CameraError,
@@ -96,7 +97,7 @@ def said_of_crowd(n_people: Tensor | None, points: Tensor) -> str:
     return (
         f"several people, up to {int(n_people.max())}, from frame {int(several[0])} on; one of them is "
         f"tracked, about pixel ({u:.0f}, {v:.0f}) in frame {first}"
-        + f", who is missing in {missing} frames that show others"
+        + f", who is missing in {counted(missing, 'frame that shows', 'frames that show')} others"
         * bool(missing)
     )
 
@@ -243,7 +244,9 @@ def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -
         missing |= confidence == 0
         confidence = np.where(missing, 0.0, confidence)
     if missing.all():
-        raise NobodySeenError(f"{path}: no keypoint is measured in any of {len(points)} frames")
+        raise NobodySeenError(
+            f"{path}: no keypoint is measured in any of {counted(len(points), 'frame')}"
+        )
     size = _check_size(path, raw.image_size)
     points, scaled = in_pixels(path, points, missing, size or image_size)
     notes = (*raw.notes, *scaled, *_note_of_filled(int(filled.sum())))
@@ -315,7 +318,9 @@ def in_pixels(
 
 
 def _note_of_filled(count: int) -> tuple[str, ...]:
-    return (f"{count} keypoints at exactly (0, 0) or (-1, -1) count as missing",) * (count > 0)
+    return (
+        f"{counted(count, 'keypoint')} at exactly (0, 0) or (-1, -1) count{'s' * (count == 1)} as missing",
+    ) * (count > 0)
 
 
 def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, arange
 
+from torchpose._core.wording import counted
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 _TAKEN, _EXCHANGED = "taken as outliers, as if missing", "left and right exchanged back in"
@@ -33,9 +34,9 @@ def outlier_notes(
     counts, frames, said = outliers.flatten(0, 1).sum(0).tolist(), _count(exchanged), []
     if any(counts):
         joints = [f"{name} {n}" for name, n in zip(UPPER_BODY, counts, strict=True) if n]
-        said.append(f"{_number(sum(counts), 'keypoint')} {_TAKEN}: {', '.join(joints)}")
+        said.append(f"{counted(sum(counts), 'keypoint')} {_TAKEN}: {', '.join(joints)}")
     if frames:
-        said.append(f"{_EXCHANGED} {_number(frames, 'frame')}")
+        said.append(f"{_EXCHANGED} {counted(frames, 'frame')}")
     return ("; ".join(said),) if said else ()
 
 
@@ -52,7 +53,3 @@ def exchanged_frames(notes: Iterable[str]) -> int:
 
 def _count(frames: Bool[Tensor, "B T"] | int) -> int:
     return int(frames.sum()) if isinstance(frames, Tensor) else frames
-
-
-def _number(count: int, thing: str) -> str:
-    return f"{count} {thing}{'s' * (count != 1)}"

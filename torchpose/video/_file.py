@@ -11,6 +11,7 @@ import numpy as np
 from torchpose._core.checks import check_rate
 from torchpose._core.images import Image
 from torchpose._core.reading import require_file
+from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError
 from torchpose.video._source_interface import VideoFrame, VideoSource
 from torchpose.video._timing import (
@@ -273,7 +274,7 @@ class FileSource(VideoSource):
 
     def _tell(self) -> None:
         """Add notes on what was found while reading."""
-        tally, count = self._tally, _plural
+        tally, count = self._tally, counted
         missing = self._kept - self._count
         if missing > 0:
             self.notes.append(f"{count(missing, 'frame')} of these could not be decoded")
@@ -299,14 +300,10 @@ class FileSource(VideoSource):
             self.notes.append(f"{' and '.join(done)} to keep {self.fps:.6g} frames per second")
 
 
-def _plural(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
-
-
 def _why_no_frame(path: Path, scan: Scan) -> str:
     if scan.frames == 0:
         return "expected a video, got one with zero frames"
-    return f"none of its {scan.frames} frames can be decoded; the file is damaged"
+    return f"none of its {counted(scan.frames, 'frame')} can be decoded; the file is damaged"
 
 
 def _orientation(frame: "av.VideoFrame") -> tuple[tuple[bool, bool, bool], bool]:

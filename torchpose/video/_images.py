@@ -10,6 +10,7 @@ import numpy as np
 
 from torchpose._core.checks import check_rate
 from torchpose._core.images import Image
+from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError, InputError
 from torchpose.video._source_interface import VideoFrame, VideoSource
 
@@ -141,7 +142,7 @@ class FolderSource(VideoSource):
         if damaged:
             names = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
             self.notes.append(
-                f"{len(damaged)} of {len(self._paths)} images cannot be read ({names}); the image "
+                f"{len(damaged)} of {counted(len(self._paths), 'image')} cannot be read ({names}); the image "
                 "before each was shown again"
             )
 

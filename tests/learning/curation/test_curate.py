@@ -156,7 +156,7 @@ def test_many_notes_on_single_files_hide_no_other(tmp_path):
         recording(joints=moving(150, seed=i), path=tmp_path / f"room{i % 2}" / "ann" / f"{i}.csv",
                   fps=None if i else 30.0,
                   notes=(f"taken for millimetres (the shoulders are apart {300 + i / 4:g})",
-                         f"{1 + i % 5} frames are not in the file: after {', '.join('789'[:1 + i % 3])}",
+                         f"frames not in the file: {1 + i % 5}, after {', '.join('789'[:1 + i % 3])}",
                          f"columns not used: {'abcdefghijklmnopqrstuvwxyz'[i]}"))
         for i in range(25)
     ]  # fmt: skip
@@ -165,7 +165,7 @@ def test_many_notes_on_single_files_hide_no_other(tmp_path):
     assert "no frame rate is stated by" in report.notes[1] and "and 22 more" in report.notes[1]
     assert report.notes[2:4] == (
         "taken for millimetres (the shoulders are apart 300) (25 recordings, numbers of the first)",
-        "1 frames are not in the file: after 7 (25 recordings, numbers of the first)",
+        "frames not in the file: 1, after 7 (25 recordings, numbers of the first)",
     )
     assert len(report.notes) == 29 and report.text().endswith("note     and 9 more")
 

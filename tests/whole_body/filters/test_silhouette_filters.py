@@ -166,7 +166,7 @@ def test_steps_are_the_run_and_elements_are_independent(name):
             torch.testing.assert_close(whole[:, frames], part, rtol=0, atol=0, equal_nan=True)
     with pytest.raises(ShapeError, match="one frame or more for each of the 3"):
         tracker.advance(state, z[:, :0], None, generator=streams)
-    with pytest.raises(InputError, match="one for each of the 3"):
+    with pytest.raises(InputError, match="must hold 3, one for each sequence"):
         tracker.advance(state, z, None, generator=streams[:2])
     alone = tracker(z[1], None, start[1], generator=generator(1))
     assert alone.mean.shape == (6, 3)

@@ -127,7 +127,8 @@ def dropped_frames(stamps: np.ndarray) -> list[str]:
         return []
     count = int(np.round(ratio[after] - 1).sum())
     return [
-        f"{count} frames are not in the file, by its time stamps: after {frame_ranges(after.tolist())}"
+        f"frames that are not in the file, by its time stamps: {count}, after "
+        f"{frame_ranges(after.tolist())}"
     ]
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchpose._core.reading import check_span, read_json, reading
+from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError, InputError, NobodySeenError
 from torchpose.io._formats.followed_person import follow_person
 from torchpose.skeleton._joint_sets import COCO, SKELETONS
@@ -128,7 +129,8 @@ def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) 
     sizes = {len(person) for person in everybody}
     if not sizes:
         raise NobodySeenError(
-            f"{folder}: nobody was found in any of {n_frames} frames; look at what the detector wrote"
+            f"{folder}: nobody was found in any of {counted(n_frames, 'frame')}; look at what "
+            "the detector wrote"
         )
     if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
         raise FileFormatError(

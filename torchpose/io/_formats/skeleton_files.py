@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchpose._core.reading import read_json, read_text, reading
+from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.kinect_csv import dropped_frames, read_kinect_csv
 from torchpose.io._formats.raw_recording import (
@@ -60,7 +61,9 @@ def _read_daily(path: Path, lines: list[str]) -> list[RawRecording]:
     frames: list[BodyFrame] = []
     for frame in range(n_frames):
         if place >= len(values):
-            raise FileFormatError(f"{path}: expected {n_frames} frames, ends in frame {frame}")
+            raise FileFormatError(
+                f"{path}: expected {counted(n_frames, 'frame')}, ends in frame {frame}"
+            )
         rows = int(values[place])
         block = values[place + 1 : place + 1 + 4 * rows]
         if rows % _ROWS_PER_BODY or rows < 0 or len(block) != 4 * rows:
@@ -102,7 +105,7 @@ def read_ntu_skeleton(path: Path) -> list[RawRecording]:
     frames = [body for frame in range(n_frames) for body in _read_frame(reader, frame)]
     if any(line.strip() for line in lines[reader.place :]):
         raise FileFormatError(
-            f"{path}, line {reader.place + 1}: expected the end after {n_frames} frames, got more"
+            f"{path}, line {reader.place + 1}: expected the end after {counted(n_frames, 'frame')}, got more"
         )
     named = _FILE_NAME.match(path.stem)
     person, action = named.groups() if named else ("", path.stem)

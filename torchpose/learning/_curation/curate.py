@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.wording import counted
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.bones import (
@@ -221,7 +222,7 @@ def _without_short_persons(
     for recording in recordings:
         person = recording.person_id
         if person in short:
-            why = f"{frames[person]} frames of this person with a whole arm, {least} are needed"
+            why = f"{counted(frames[person], 'frame')} of this person with a whole arm, {least} are needed"
             drops.append(_whole("too few frames", recording, why))
     return [r for r in recordings if r.person_id not in short]
 

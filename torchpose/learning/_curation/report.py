@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+from torchpose._core.wording import counted
 from torchpose.io._formats.raw_recording import frame_ranges
 
 _SHOWN_NOTES = 20
@@ -34,7 +35,7 @@ class Drop(NamedTuple):
         why = f" ({self.why})" if self.why else ""
         return (
             f"{self.reason}: {self.file}, person {self.person}: {joint}"
-            f"{_several(self.n_frames, 'frame')} {self.frames}{why}"
+            f"{counted(self.n_frames, 'frame')} {self.frames}{why}"
         )
 
 
@@ -49,8 +50,8 @@ class Size(NamedTuple):
     def text(self) -> str:
         """Return the counts in words."""
         return (
-            f"{_several(self.recordings, 'recording')} of {_several(self.persons, 'person')}, "
-            f"{_several(self.frames, 'frame')}, {_several(self.joints, 'joint')}"
+            f"{counted(self.recordings, 'recording')} of {counted(self.persons, 'person')}, "
+            f"{counted(self.frames, 'frame')}, {counted(self.joints, 'joint')}"
         )
 
 
@@ -129,7 +130,3 @@ def drop_frames(
     """Return a `Drop` of these frames, counted from 0; `first` is the number of the first in the file."""
     listed = list(frames)
     return Drop(reason, file, person, joint, frame_ranges(listed, first), len(listed), why)
-
-
-def _several(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.checks import check_rate
+from torchpose._core.wording import counted
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError
@@ -206,10 +207,11 @@ class FittedActions:
         lines = []
         for action, (space, _) in self.spaces.items():
             line = (
-                f"{action}: {space.info.performances} performances of {len(space.info.persons)} persons, "
+                f"{action}: {counted(space.info.performances, 'performance')} of "
+                f"{counted(len(space.info.persons), 'person')}, "
                 f"{space.n_postures} postures, {len(space.info.key_frames)} key frames, "
-                f"{space.n_dimensions} dimensions with {100 * (space.info.explained or 0):.1f} % of the "
-                "variance"
+                f"{counted(space.n_dimensions, 'dimension')} with "
+                f"{100 * (space.info.explained or 0):.1f} % of the variance"
             )
             if action in self.accepted:
                 passed = 100 * self.accepted[action]
@@ -217,7 +219,9 @@ class FittedActions:
             lines.append(line)
         left_out = self.performances.left_out
         if left_out:
-            lines.append(f"left out {left_out} repetitions shorter than {LEAST_FRAMES} frames")
+            lines.append(
+                f"left out {counted(left_out, 'repetition')} shorter than {LEAST_FRAMES} frames"
+            )
         return "\n".join(lines)
 
 

@@ -12,6 +12,7 @@ import torch
 from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_rate
+from torchpose._core.wording import counted
 from torchpose.body._articulation import Articulation
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
@@ -185,7 +186,7 @@ def motion_summary(motion: BodyMotion, held_out: MotionSpread | None) -> str:
     info = motion.info
     text = (
         f"{info.name}: motion of {motion.articulation.n_pose} columns and {len(motion.poses.weights)} "
-        f"kinds of poses from {info.n_frames} frames of {len(info.persons)} persons"
+        f"kinds of poses from {info.n_frames} frames of {counted(len(info.persons), 'person')}"
     )
     if held_out is None:
         return text

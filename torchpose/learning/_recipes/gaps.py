@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.wording import first_of
+from torchpose._core.wording import counted, first_of
 from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
@@ -86,7 +86,8 @@ def notes_on_gaps(recordings: Sequence[Recording]) -> tuple[str, ...]:
         return ()
     files = [_file_of(r) for r, count in zip(recordings, counts, strict=True) if count]
     return (
-        f"{sum(counts)} frames with missing joints are interpolated, in gaps of up to {LONGEST_GAP:g} s: "
+        f"{counted(sum(counts), 'frame with missing joints is', 'frames with missing joints are')} "
+        f"interpolated, in gaps of up to {LONGEST_GAP:g} s: "
         f"{first_of(files, 1)}",
     )
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_rate
+from torchpose._core.wording import counted
 from torchpose.body._kinematics import Body, centres_of
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
@@ -182,7 +183,7 @@ def summary(conditionals: LimbConditionals, held_out: LimbSpread | None) -> str:
     info = conditionals.info
     text = (
         f"{info.name}: {len(conditionals.edges)} limbs from {info.n_frames} frames of "
-        f"{len(info.persons)} persons at {info.fps:g} frames per second"
+        f"{counted(len(info.persons), 'person')} at {info.fps:g} frames per second"
     )
     if held_out is None:
         return text

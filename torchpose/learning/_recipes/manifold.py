@@ -18,6 +18,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.digests import digest_of
 from torchpose._core.files import atomic_path
+from torchpose._core.wording import counted
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, OutputError
 from torchpose.io._formats.axes import Axes
@@ -310,8 +311,8 @@ def _last_apart(
         own = [r for r in recordings if r.person_id == person]
         if len(own) <= count:
             raise InputError(
-                f"{person} has {len(own)} recordings, and {count} of them are to be held out; hold "
-                "fewer out (validation), name persons to hold out, or add recordings"
+                f"{person} has {counted(len(own), 'recording')}, and {count} of them are to be held out; "
+                "hold fewer out (validation), name persons to hold out, or add recordings"
             )
         refuse_shared_recordings(own[:-count], own[-count:])
         fitted += own[:-count]

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_choice
+from torchpose._core.wording import counted
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError
@@ -219,14 +220,14 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         shut = (clamped == 1).nonzero().flatten() + first_frame
         if len(shut):
             found.append(
-                f"in {len(shut)} frames, the first of them {int(shut[0])}, the gate rejected every "
-                "draw: the person did something else, or the body is not theirs; a bank of several "
-                "actions lets go there"
+                f"in {counted(len(shut), 'frame')}, the first of them {int(shut[0])}, the gate "
+                "rejected every draw: the person did something else, or the body is not theirs; a bank of "
+                "several actions lets go there"
             )
         released = track.details.get("released")
         if released is not None and bool(released.any()):
             found.append(
-                f"in {int(released.sum())} frames none of the actions was likeliest, and the "
+                f"in {counted(int(released.sum()), 'frame')} none of the actions was likeliest, and the "
                 "constraint was released"
             )
         return tuple(found)

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.wording import counted
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_start import start
@@ -30,8 +31,8 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
         return ()
     return (
         "left and right seem to be exchanged in all cameras: with the other sides bodies are likelier "
-        f"(log-evidence {float(gains.sum()):.0f} more, in {len(gains)} frames), so people may look "
-        "backwards; check the names of the keypoints, and whether all videos are mirrored",
+        f"(log-evidence {float(gains.sum()):.0f} more, in {counted(len(gains), 'frame')}), so people may "
+        "look backwards; check the names of the keypoints, and whether all videos are mirrored",
     )
 
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.wording import counted
 from torchpose.body._skeleton import BODY_15
 
 TOO_FEW = "too few keypoints were given"
@@ -87,8 +88,8 @@ def notes_of(
     if guessed and not sized:
         seen_by = ", ".join(cameras[c] for c in alone[alone >= 0].unique().tolist())
         notes.append(
-            f"one camera alone ({seen_by}) saw the person in {guessed} frames: size and distance there "
-            "are those of an average person; give height or body if one of them is known"
+            f"one camera alone ({seen_by}) saw the person in {counted(guessed, 'frame')}: size and "
+            "distance there are those of an average person; give height or body if one of them is known"
         )
     notes += [
         f"nothing was measured in frames {first_frame + first} to {first_frame + last}; the poses "
