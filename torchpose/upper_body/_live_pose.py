@@ -49,7 +49,7 @@ class LivePose(NamedTuple):
         log_evidence: [B, 2], the increment of the left and of the right arm; see `PoseTrack`.
         effective_sample_size: [B, 2], that of the particles or tracks of each arm; see `PoseTrack`.
         unseen: [B], the time since any joint was measured, seconds; 0 where one is.
-        failed: [B], True where the filter degenerated: poses are NaN until the stream is reinitialised.
+        failed: [B], True where the filter degenerated: poses are NaN until the stream begins anew, by `init`.
         inlier_probability: [B, 8], the probability that the keypoint of a joint is no outlier; see
             `PoseTrack`.
         bone_lengths: [B, 4], metres. bone_covariance: [B, 4, 4], metres squared; see `PoseTrack`.

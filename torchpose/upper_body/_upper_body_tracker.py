@@ -311,8 +311,9 @@ class UpperBodyTracker(WideModule):
         """Begin to track live streams, frame by frame (`step`).
 
         Args:
-            batch_size: B, the number of streams. names: the names of the keypoints, as in `forward`; any
-                of them may be missing in any frame. generator: as in `forward`; the state holds it.
+            batch_size: B, the number of streams, which begin together; where people come and go, begin one
+                for each of them. names: the names of the keypoints, as in `forward`; any of them may be
+                missing in any frame. generator: as in `forward`; the state holds it.
 
         Returns:
             `StreamState` before the first frame.

@@ -244,7 +244,7 @@ class BodyTracker(nn.Module):
         smoothing: str = "none",
         refine: str = "none",
         generator: torch.Generator | None = None,
-        lengths: Integer[Tensor, "1"] | None = None,
+        lengths: Integer[Tensor, " S"] | None = None,
         facing: Float[Tensor, "3"] | None = None,
         n_frames: int | None = None,
         progress: bool = False,
@@ -253,9 +253,9 @@ class BodyTracker(nn.Module):
 
         Args:
             keypoints: [T, C, J, 2], pixels as detected, NaN where there is none; "kalman" takes
-                [B, T, C, J, 2] as well, and of these arguments only the first seven and `progress`. With
-                `persons` [T, C, D, J, 2], of D detections in each camera, in any order, NaN where there are
-                fewer.
+                [B, T, C, J, 2] as well, and of these arguments only the first seven, `lengths` and
+                `progress`. With `persons` [T, C, D, J, 2], of D detections in each camera, in any order, NaN
+                where there are fewer.
             confidence: [..., C, J], from 0 (no keypoint) to 1; all 1 by default.
             names: of the J joints, of any known set; those of `BODY_15` by default.
             covariance: [..., C, J], variance along u and v, pixels squared, in place of the usual noise.
@@ -273,8 +273,8 @@ class BodyTracker(nn.Module):
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
                 if None, in keypoints by the Kalman smoother, else in silhouettes (`find_first_pose`).
             generator: the generator of random numbers.
-            lengths: [1], the number of frames of the sequence, if they are fewer; past them the last pose
-                is repeated.
+            lengths: [1], the number of frames of the sequence, if they are fewer, of keypoints
+                [B, T, C, J, 2] [B]; past them the last pose is repeated, and nothing there counts.
             facing: [3], the direction in which the person looks at first, world axes, if it is known and the
                 first pose is found in silhouettes.
             n_frames: the expected number of frames, for the bar. progress: whether to show one.
@@ -293,16 +293,19 @@ class BodyTracker(nn.Module):
             check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
             keypoints = keypoints_alone(self.method, silhouettes, keypoints)
             others = {
-                "initial_state": initial_state, "generator": generator, "lengths": lengths,
-                "facing": facing, "n_frames": n_frames,
+                "initial_state": initial_state, "generator": generator, "facing": facing,
+                "n_frames": n_frames,
             }  # fmt: skip
             refuse(given_of(others), f"for method {self.method}")
             options: dict[str, Any] = {
                 "covariance": covariance, "smoothing": smoothing, "progress": progress
             }  # fmt: skip
             if persons is None:
-                return self.by_keypoints(keypoints, confidence, names, refine=refine, **options)
+                return self.by_keypoints(
+                    keypoints, confidence, names, refine=refine, lengths=lengths, **options
+                )
             check_not_refined(refine)
+            refuse(given_of({"lengths": lengths}), "with persons")
             people = PeopleBodyTracker(self.by_keypoints, persons)
             return people.forward(keypoints, confidence, names, **options)
         check_filters_one(self.method, smoothing, refine, persons)

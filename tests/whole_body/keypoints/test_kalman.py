@@ -387,6 +387,48 @@ def test_a_batch_gives_each_its_own(four, filtered):
     torch.testing.assert_close(both[1].joints3d, filtered.joints3d, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("smoothing", ["none", "full"])
+@pytest.mark.parametrize("n_cameras", [1, 4])
+def test_a_batch_of_different_lengths_gives_each_its_own(n_cameras, smoothing):
+    given = scene(n_cameras, 24)
+    keypoints, confidence = (
+        given.keypoints.repeat(3, 1, 1, 1, 1),
+        given.confidence.repeat(3, 1, 1, 1),
+    )
+    keypoints[1] += 1.5
+    lengths = torch.tensor([9, 20, 16])
+    close = (
+        1e-9 if n_cameras > 1 else 1e-6
+    )  # of one camera a network of single precision lifts poses
+    follow = tracker(given.rig)
+    tracks = follow(
+        keypoints=keypoints, confidence=confidence, smoothing=smoothing, lengths=lengths
+    )
+    for track, points, trust, n in zip(
+        tracks, keypoints, confidence, lengths.tolist(), strict=True
+    ):
+        alone = follow(keypoints=points[:n], confidence=trust[:n], smoothing=smoothing)
+        cut = follow(
+            keypoints=points, confidence=trust, smoothing=smoothing, lengths=torch.tensor([n])
+        )
+        for name in ("joints3d", "covariance3d", "state", "coasting"):
+            own = getattr(alone, name)
+            torch.testing.assert_close(getattr(track, name)[:n], own, rtol=0, atol=close)
+            torch.testing.assert_close(getattr(cut, name)[:n], own, rtol=0, atol=1e-9)
+        assert track.notes == cut.notes == alone.notes and len(track) == len(cut) == 24
+        assert (track.joints3d[n:] == track.joints3d[n - 1]).all()
+        assert not track.log_evidence[n:].any()
+
+
+def test_lengths_that_no_sequence_has_are_refused(four):
+    for wrong in ([0], [41], [3, 4]):
+        with pytest.raises((InputError, ShapeError), match="lengths must"):
+            tracker(four.rig)(keypoints=four.keypoints, lengths=torch.tensor(wrong))
+    detections = four.keypoints[:, :, None]
+    with pytest.raises(InputError, match="lengths does nothing with persons"):
+        tracker(four.rig)(keypoints=detections, persons="all", lengths=torch.tensor([3]))
+
+
 def test_a_joint_set_in_another_order_and_without_a_pelvis(four, filtered):
     order = [i for i in range(len(NAMES)) if NAMES[i] != "pelvis"][::-1]
     found = tracker(four.rig)(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor, nn
 
 from torchpose._core.checks import (
@@ -21,10 +21,11 @@ from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError, ShapeError
+from torchpose.filters._measurements import check_lengths
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._foot_prior import shipped_foot_prior
 from torchpose.priors._shipped import load_body_motion
-from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._body_track import BodyTrack, repeat_last
 from torchpose.whole_body._keypoints.camera_conventions import check_conventions
 from torchpose.whole_body._keypoints.camera_notes import notes_on_refined
 from torchpose.whole_body._keypoints.camera_refinement import (
@@ -57,7 +58,7 @@ from torchpose.whole_body._keypoints.known_person import (
     with_height,
 )
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
-from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.nested import mapped, part_of
 from torchpose.whole_body._keypoints.track_builder import TrackBuilder, without_poses
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
@@ -153,6 +154,7 @@ class KeypointBodyTracker(nn.Module):
         covariance: Float[Tensor, "*B T C J"] | None = None,
         smoothing: str = "none",
         refine: str = "none",
+        lengths: Integer[Tensor, " S"] | None = None,
         progress: bool = False,
     ) -> BodyTrack | list[BodyTrack]:
         """Track whole sequences; see `BodyTracker.forward`."""
@@ -172,22 +174,28 @@ class KeypointBodyTracker(nn.Module):
         if single:
             frames = frames.map(lambda value: value[None])
             feet = None if feet is None else feet.map(lambda value: value[None])
+        n_frames = frames.pixels.shape[1]
+        ends = check_lengths(lengths, len(frames.pixels), n_frames, frames.pixels.device)
+        frames = _until(frames, ends)
+        feet = None if feet is None else _until(feet, ends)
         self.check_cameras(frames)
         begun = self.first_frames(frames)
         if refine != "none":
             frames = frames.map(lambda value: value[:, begun[0] :])
             feet = None if feet is None else feet.map(lambda value: value[:, begun[0] :])
-            return self._refined_track(
+            refined = self._refined_track(
                 frames, feet, refine, smoothing == "full", progress, begun[0]
             )
-        poses = self.tracker(frames, smoothing == "full", progress)
+            return repeat_last(refined, n_frames - int(ends))
+        poses = self.tracker(frames, smoothing == "full", progress, lengths=ends)
         found = self.feet_of(poses, feet, smoothing == "full")
-        tracks = [
-            self.builder.track(poses, frames, b, cameras=b == 0, feet=found)
-            for b in range(len(frames.pixels))
-        ]
-        for track in tracks:
+        tracks = []
+        for b, end in enumerate(ends.tolist()):
+            own, seen = part_of((poses, frames), slice(0, end))
+            standing = None if found is None else part_of(found, slice(0, end))
+            track = self.builder.track(own, seen, b, cameras=b == 0, feet=standing)
             track.notes += late_note(track.first_frame, TOO_FEW)
+            tracks.append(repeat_last(track, n_frames - end))
         return tracks[0] if single else tracks
 
     @torch.no_grad()
@@ -353,6 +361,13 @@ class KeypointBodyTracker(nn.Module):
         moved = in_time(self.rig, single, found.errors.values, found.poses.joints[0][:, ankles])
         frames = moved.map(lambda value: value[None])
         return track_feet(self.feet, RigMaps.of(found.rig), found.poses, frames, smoothing)
+
+
+def _until(frames: KeypointFrame, lengths: Int[Tensor, " B"]) -> KeypointFrame:
+    """Return frames [B, T, ...] to the end of the longest sequence, without keypoints past each one's own."""
+    frames = part_of(frames, slice(0, int(lengths.max())))
+    inside = torch.arange(frames.inlier.shape[1], device=lengths.device) < lengths[:, None]
+    return frames._replace(inlier=frames.inlier * inside[:, :, None, None])
 
 
 def _n_wrong(off: Bool[Tensor, "T C"], turn: Float[Tensor, "C 3 3"]) -> float:

@@ -107,13 +107,15 @@ class KeypointTracker(nn.Module):
         progress: bool = False,
         waited: float = 0.0,
         watch: bool = True,
+        lengths: Int[Tensor, " B"] | None = None,
     ) -> KeypointPoses:
         """Track whole sequences.
 
         Args:
             frames: [B, T, C, J, ...]. smoothing: whether later frames count too. progress: show a bar.
             waited: frames for which the first one has waited for a second camera already.
-            watch: as of `advance`.
+            watch: as of `advance`. lengths: frames of each sequence, after which nothing is measured and from
+                which smoothing begins; all if None.
         """
         n_frames = frames.pixels.shape[1]
         stream: KeypointStream | None = None
@@ -122,7 +124,15 @@ class KeypointTracker(nn.Module):
             frame: KeypointFrame = frame_at(frames, t)
             stream, pose, found = self.advance(stream, frame, waited=waited, watch=watch)
             every.add(to_be_smoothed(pose, found) if smoothing else pose)
-        return self.smoothed(*every.sequence) if smoothing else every.sequence
+        if not smoothing:
+            return every.sequence
+        poses, widened = every.sequence
+        if (
+            lengths is not None
+        ):  # a frame in which tracking begins anew says nothing of those before
+            past = torch.arange(n_frames, device=lengths.device) == lengths[:, None]
+            poses = poses._replace(started=poses.started | past)
+        return self.smoothed(poses, widened)
 
     def advance(
         self,
