@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import FileFormatError, InputError
-from torchpose.io._formats.axes import AXES, axes_rotation, check_upright, default_axes, heading
+from torchpose.io._formats.axes import (
+    AXES,
+    axes_rotation,
+    check_upright,
+    default_axes,
+    heading,
+    note_on_lying,
+)
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 NAMES = ("head", "shoulder_left", "shoulder_right", "hip_left", "hip_right")
@@ -48,6 +55,17 @@ def test_rooms_are_turned_towards_the_camera(angle, axes):
     joints = turned.expand(3, 5, 3)
     M = axes_rotation(joints, NAMES, axes)
     torch.testing.assert_close(joints @ M.mT, FACING.expand(3, 5, 3))
+
+
+@pytest.mark.parametrize(
+    ("written", "said"), [("y-up", "z-up"), ("z-up", "y-up"), ("kinect", "z-up")]
+)
+def test_axes_that_exchange_up_and_forwards_are_doubted(written, said):
+    joints = WRITTEN[written].expand(4, 5, 3)
+    right, wrong = (joints @ axes_rotation(joints, NAMES, axes).mT for axes in (written, said))
+    [note] = note_on_lying(wrong, NAMES)
+    assert "90 degrees" in note and "axes.txt" in note
+    assert note_on_lying(right, NAMES) == [] == note_on_lying(wrong[:, 1:3], NAMES[1:3])
 
 
 def test_a_camera_is_never_turned():

@@ -96,6 +96,23 @@ def test_axes_of_file_argument_and_joint_set(tmp_path):
         read_recording(path, axes="sideways")
 
 
+def test_a_folder_says_the_axes_of_its_recordings(tmp_path):
+    """Two devices of different axes in one fit, neither of which its files state."""
+    room = np.stack([pose()[..., 0], pose()[..., 2], -pose()[..., 1]], -1)
+    for folder, joints, axes in (("a", pose(), "camera"), ("b", room, "z-up\n")):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "x.npz", joints=joints)
+        (tmp_path / folder / "axes.txt").write_text(axes)
+    of_a, of_b = read_recordings(tmp_path)
+    assert of_a.joints.equal(read_recording(tmp_path / "a" / "x.npz", axes="camera")[0].joints)
+    assert of_b.joints.equal(read_recording(tmp_path / "b" / "x.npz", axes="z-up")[0].joints)
+    assert notes_on_unread_files(tmp_path, find_recordings(tmp_path)) == []
+    (tmp_path / "b" / "axes.txt").write_text("up")
+    with pytest.raises(FileFormatError, match=r"axes.txt: expected one of camera.*got 'up'"):
+        read_recordings(tmp_path)
+    assert read_recordings(tmp_path, axes="camera")[0].joints.equal(of_a.joints)
+
+
 def test_an_unknown_set_needs_axes(tmp_path):
     names = np.array(["head", "lshoulder", "rshoulder"])
     path = write(tmp_path / "a.npz", joints=pose()[:, [3, 2, 5]], names=names)

@@ -93,7 +93,8 @@ def run(
         out: the prior, NAME.safetensors.
         recipe: settings of `UpperBodyRecipe`.
         samples: training states per arm (default 100000).
-        axes: axes of all recordings; by default what each file says, else what its joint set usually has.
+        axes: axes of all recordings; by default what a file axes.txt in the folder says, else each file, else
+            what its joint set usually has.
         without: persons to leave out, to test on later.
         curate: leave out what jumps or is no body, and say so.
         curation: settings of `CurationSettings`.

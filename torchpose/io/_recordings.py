@@ -15,15 +15,17 @@ import torch
 from torch import Tensor
 
 from torchpose._core.checks import check_rate
-from torchpose._core.reading import npz_keys, reading, require_file
+from torchpose._core.reading import npz_keys, read_text, reading, require_file
 from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.io._formats.axes import (
+    AXES,
     axes_rotation,
     body_unit,
     check_upright,
     default_axes,
     heading,
+    note_on_lying,
 )
 from torchpose.io._formats.kinect_csv import ROW_LENGTHS, header_joints, is_row, read_kinect_csv
 from torchpose.io._formats.mocap_files import read_bvh, read_c3d
@@ -50,6 +52,7 @@ _READERS: dict[str, Callable[[Path], list[RawRecording]]] = {
     ".c3d": read_c3d,
 }
 _SUFFIXES = tuple(_READERS)
+_AXES_FILE = "axes.txt"
 _SNIFFED = 65536  # bytes from the start of a file that tell whether it is a recording
 BACK_TO_CAMERA = (
     "by the shoulders the person's back is to the camera; if it is not, the joints are mirrored, or left and "
@@ -141,8 +144,8 @@ def read_recording(path: str | Path, axes: str | None = None) -> list[Recording]
 
     Args:
         path: the file.
-        axes: ``camera``, ``kinect``, ``y-up`` or ``z-up``; without it, what the file says, else
-            what its joint set usually has.
+        axes: ``camera``, ``kinect``, ``y-up`` or ``z-up``; without it, what a file ``axes.txt`` in the
+            folder says, else the file itself, else what its joint set usually has.
 
     Returns:
         A `Recording` per person, in camera axes; the one whose file it is first.
@@ -159,7 +162,18 @@ def read_recording(path: str | Path, axes: str | None = None) -> list[Recording]
             f"{path}: expected one of {', '.join(_SUFFIXES)}, got {path.suffix or 'no suffix'}"
         )
     with reading(path, "a recording of 3D joints"):
-        return _read_recording(path, reader, axes)
+        return _read_recording(path, reader, axes or _axes_of_folder(path.parent))
+
+
+def _axes_of_folder(folder: Path) -> str | None:
+    """Return the axes of the recordings in a folder if a file says them: devices differ, folders hold one."""
+    file = folder / _AXES_FILE
+    if not file.is_file():
+        return None
+    axes = read_text(file, f"one of {', '.join(AXES)}").strip()
+    if axes not in AXES:
+        raise FileFormatError(f"{file}: expected one of {', '.join(AXES)}, got {axes!r:.40}")
+    return axes
 
 
 def _read_recording(
@@ -187,7 +201,7 @@ def read_recordings(
 
     Args:
         paths: one path or several; folders are searched, see `find_recordings`.
-        axes: ``camera``, ``kinect``, ``y-up`` or ``z-up``, of all files; by default what each file or its
+        axes: ``camera``, ``kinect``, ``y-up`` or ``z-up``, of all files; by default what each folder, file or
             joint set says, see `read_recording`.
 
     Returns:
@@ -244,7 +258,11 @@ def notes_on_unread_files(
     """
     read = set(found)
     files = [f for p in _as_paths(paths) if p.is_dir() for f in sorted(p.rglob("*")) if f.is_file()]
-    unread = [f for f in dict.fromkeys(files) if f not in read and not f.name.startswith(".")]
+    unread = [
+        f
+        for f in dict.fromkeys(files)
+        if f not in read and f.name[0] != "." and f.name != _AXES_FILE
+    ]
     unread = [f for f in unread if f.suffix.lower() in _SUFFIXES[1:]]
     archives = {f.parent for f in read if f.suffix.lower() == ".npz"}
     beside = [f for f in unread if f.parent in archives]
@@ -343,7 +361,7 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
         raise type(error)(f"{where}: {error}") from error
     tensor = tensor @ rotation.mT
     check_upright(where, tensor, raw.names)
-    notes += _notes_on_heading(tensor, raw.names)
+    notes += note_on_lying(tensor, raw.names) or _notes_on_heading(tensor, raw.names)
     skeleton = identify_skeleton(raw.names)
     weights = None
     if raw.weights is not None:

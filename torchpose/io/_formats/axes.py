@@ -38,7 +38,7 @@ def default_axes(where: str, names: Sequence[str]) -> str:
         raise FileFormatError(
             f"{where}: these {len(names)} joints are no known set, so the axes are not known; "
             f"state them: axes = {', '.join(AXES)} (key `axes` in the .npz, `# axes = ...` above the "
-            "header of a table, or --axes of torchpose fit)"
+            "header of a table, a file axes.txt in the folder, or --axes of torchpose fit)"
         )
     return skeleton.axes
 
@@ -137,15 +137,40 @@ def check_upright(where: str, joints: Float[Tensor, "T J 3"], names: Sequence[st
             return
 
 
+def note_on_lying(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> list[str]:
+    """Return a note if the head is rather beside the hips than above them, by the median over frames.
+
+    So it is in wrong axes that exchange up and forwards, which put nobody upside down.
+
+    Args:
+        joints: [T, J, 3] in camera axes (y down), metres. names: the J names.
+    """
+    index = {name: i for i, name in enumerate(canonical_names(names))}
+    tops = [name for name in ("head", "upper_neck", "neck", "shoulder_center") if name in index]
+    hips = [index[name] for name in ("hip_left", "hip_right", "hip_center") if name in index]
+    if not tops or not hips:
+        return []
+    line = joints[:, hips].nanmean(1) - joints[:, index[tops[0]]]
+    lean = _median(torch.atan2(line[:, [0, 2]].norm(dim=-1), line[:, 1]))
+    if lean is None or lean < _LYING:
+        return []
+    return [
+        f"by these axes the person lies: from the hips to the {tops[0]} it is {math.degrees(lean):.0f} "
+        "degrees from the vertical in the median frame; of somebody who stands or sits the axes are others, which "
+        f"--axes says ({', '.join(AXES)}), or a file axes.txt in the folder"
+    ]
+
+
 def _raise_upside_down(where: str, top: str, below: str, drop: float) -> None:
     raise FileFormatError(
         f"{where}: after conversion to camera axes (y down) the {top} lies {-100 * drop:.0f} cm "
         f"below the {below}s in the median frame; the axes are others than assumed: state them with "
-        f"axes = {', '.join(AXES)} (key `axes` in the .npz, or --axes; the Azure Kinect SDK gives "
-        "camera axes)"
+        f"axes = {', '.join(AXES)} (key `axes` in the .npz, --axes, or a file axes.txt in the folder; the "
+        "Azure Kinect SDK gives camera axes)"
     )
 
 
+_LYING = math.pi / 3  # from the vertical
 METRES_PER = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _TEXT = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 _LARGEST = 5.0  # metres: nobody spans more
