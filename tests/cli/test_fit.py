@@ -29,6 +29,7 @@ def test_prior_is_that_of_the_library(torchpose, files, tmp_path):
     assert prior.info.persons == ("recordings#p1", "recordings#p2")
     assert prior.info.command.startswith(f"torchpose fit {folder} --out {out} --components 2")
     assert "kept     2 recordings of 2 persons, 900 frames" in done.out
+    assert "persons  2, named in the file and its card: recordings#p1, recordings#p2" in done.out
     assert out.with_suffix(".md").read_text().startswith("# mine")
     assert {p.name for p in out.parent.iterdir()} == {
         "mine.safetensors", "mine.md", ".torchpose-fit-mine.json"

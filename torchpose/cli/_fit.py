@@ -90,7 +90,8 @@ def run(
     Args:
         recordings: folders (with their subfolders) or files; a folder is a person where a file does not
             say whose it is. Kinect v1, v2 (.csv, .skeleton) and Azure, .npz, .bvh, .c3d, OpenCV .yaml.
-        out: the prior, NAME.safetensors.
+        out: the prior, NAME.safetensors. It and its card hold names of persons and of folders, and the
+            command: give patients codes.
         recipe: settings of `UpperBodyRecipe`.
         samples: training states per arm (default 100000).
         axes: axes of all recordings; by default what a file axes.txt in the folder says, else each file, else

@@ -7,6 +7,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from torchpose._core.tensor_file import format_of
+from torchpose._core.wording import first_of
 from torchpose.errors import OutputError
 from torchpose.io._results import ResultsFolder
 from torchpose.learning._body_motion_fit import BodyMotionRecipe
@@ -17,6 +18,8 @@ from torchpose.learning._recipes.gaps import notes_on_gaps
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
+
+_SHOWN = 3  # persons
 
 
 def check_fit_file(name: str | Path) -> Path:
@@ -195,7 +198,7 @@ def _prior_lines(prior: UpperBodyPrior) -> list[str]:
     lines = [
         f"prior    {info.name}, {prior.n_components} components per arm{over}, neck: {info.neck}, "
         f"hand: {info.hand}",
-        f"persons  {len(info.persons)}",
+        f"persons  {len(info.persons)}, named in the file and its card: {first_of(info.persons, _SHOWN)}",
         f"states   {info.n_samples} per arm from {info.n_frames} recorded frames",
     ]
     fit = info.extra.get("fit")

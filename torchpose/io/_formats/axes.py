@@ -156,8 +156,8 @@ def note_on_lying(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> list[
         return []
     return [
         f"by these axes the person lies: from the hips to the {tops[0]} it is {math.degrees(lean):.0f} "
-        "degrees from the vertical in the median frame; of somebody who stands or sits the axes are others, which "
-        f"--axes says ({', '.join(AXES)}), or a file axes.txt in the folder"
+        "degrees from the vertical in the median frame; of somebody who stands or sits the axes are "
+        f"others, which --axes says ({', '.join(AXES)}), or a file axes.txt in the folder"
     ]
 
 
