@@ -9,6 +9,8 @@ import numpy as np
 
 from torchpose._core.digests import digest_of_files
 from torchpose.errors import InputError
+from torchpose.io._formats.keypoint_files import is_keypoint_header
+from torchpose.io._formats.table_rows import split_row
 from train.predict_summary import COLUMNS
 
 __all__ = ["Found", "KeypointRecording", "content_of", "find_keypoints", "share"]
@@ -137,7 +139,7 @@ def _holds(path: Path) -> tuple[str, ...]:
     except (zipfile.BadZipFile, OSError):
         return _POINTS if is_npz else (_FIRST,)  # reading it gives the error
     header = next((line for line in lines if line.strip() and not line.startswith("#")), _FIRST)
-    return tuple(cell.strip() for cell in header.split(","))
+    return tuple(split_row(header))
 
 
 def _is_result(holds: tuple[str, ...]) -> bool:
@@ -149,7 +151,7 @@ def _fault(path: Path, holds: tuple[str, ...]) -> str:
     if path.suffix.lower() == ".npz":
         expected, there = "an array keypoints or joints2d", not set(holds).isdisjoint(_POINTS)
     else:
-        expected, there = f"a first column {_FIRST}", holds[0].lower() == _FIRST
+        expected, there = f"a column {_FIRST}", is_keypoint_header(holds)
     names = ", ".join(name.removesuffix(".npy") for name in holds)
     return "" if there else f"expected {expected}, got {names[:_LONGEST] or 'none'}"
 

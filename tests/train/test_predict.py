@@ -239,10 +239,17 @@ def test_openpose_folders_csv_and_names_that_clash(tmp_path) -> None:
         (folder / f"f{frame}_keypoints.json").write_text("{}")
     (tmp_path / "clips" / "k.csv").write_text("# fps = 30\nframe,head_x,head_y\n0,1,2\n")
     (tmp_path / "clips" / "t.csv").write_text("time,price\n0,1\n")
+    (tmp_path / "clips" / "german.csv").write_text("time;frame_number;head_x;head_y\n0,5;0;1;2\n")
+    (tmp_path / "clips" / "dlc.csv").write_text("scorer,a\nbodyparts,head\ncoords,x\n0,1\n")
+    assert [r.name for r in find_keypoints([tmp_path / "clips"]).recordings] == [
+        "dlc", "k", "wave", "german"
+    ]  # fmt: skip
+    for name in ("german", "dlc"):
+        (tmp_path / "clips" / f"{name}.csv").unlink()
     found = find_keypoints([tmp_path / "clips"])
     assert [r.name for r in found.recordings] == ["k", "wave"]
     table = str(tmp_path / "clips" / "t.csv")
-    assert found.others == {table: "expected a first column frame, got time, price"}
+    assert found.others == {table: "expected a column frame, got time, price"}
     write_recording(tmp_path / "k.npz", 3)
     with pytest.raises(InputError, match=r"both results would be called k\.npz"):
         find_keypoints([tmp_path / "clips", tmp_path / "k.npz"])
@@ -279,7 +286,7 @@ def test_a_folder_with_a_file_that_is_no_recording_is_not_done(data, prior_file,
     assert main(arguments) == 1
     said = capsys.readouterr()
     assert "1 recording: 1 made before" in said.out
-    assert "bad4.csv: expected a first column frame, got time, price" in said.err
+    assert "bad4.csv: expected a column frame, got time, price" in said.err
     assert "no recordings: 1 more files, which the summary lists" in said.err
     (folder / "a.npz").unlink()
     assert main(arguments) == 2

@@ -276,15 +276,14 @@ def _holds_recordings(path: Path) -> bool:
 def _starts_as_keypoints(path: Path) -> bool:
     """Return whether a table begins with a header, as keypoints do and recordings of a Kinect do not."""
     from torchpose._core.reading import reading, require_file
-    from torchpose.io._formats.keypoint_files import FRAME_COLUMNS
+    from torchpose.io._formats.keypoint_files import is_keypoint_header
     from torchpose.io._formats.table_rows import split_row
 
     path = require_file(path)
     with reading(path, "a table"), path.open(encoding="utf-8-sig", errors="replace") as stream:
         lines = stream.read(_SNIFFED).splitlines()
     first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    begins = (*FRAME_COLUMNS, "scorer")  # the second is DeepLabCut's
-    return any(cell.lower() in begins for cell in split_row(first))
+    return is_keypoint_header(split_row(first))
 
 
 def _length(n_frames: int, fps: float | None) -> str:

@@ -25,14 +25,18 @@ from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 _SHOWN = 3  # columns that a message lists
 _TRUST = ("confidence", "visibility")  # names of it; MediaPipe's is the second
 _SCORES = (*_TRUST, "score", "likelihood")  # names of it in tables
-FRAME_COLUMNS = ("frame", "frame_number", "frame_index", "frame_idx", "frame_id", "sync_index")
-"""What the column of the frame is called, in small letters."""
+_FRAMES = ("frame", "frame_number", "frame_index", "frame_idx", "frame_id", "sync_index")
 _NAMES = ("name", "keypoint", "landmark", "joint", "bodypart")
 _PASSED_OVER = ("z", "presence")  # beside x and y; MediaPipe's depth is no measurement
 _DEEPLABCUT = {"scorer", "individuals", "bodyparts", "coords"}  # first cells of its header
 _OF_SEVERAL_CAMERAS = {"point_id", "img_loc_x", "img_loc_y"}
 _NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
+
+
+def is_keypoint_header(cells: Sequence[str]) -> bool:
+    """Return whether the cells of a first line name a column of frames, or begin DeepLabCut's header."""
+    return any(cell.lower() in (*_FRAMES, "scorer") for cell in cells)
 
 
 @dataclass
@@ -84,7 +88,7 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
             f"{path}: expected a table of one camera, got one of several, as Caliscope writes it; write a "
             "table frame,landmark,x,y of each from sync_index, names of point_id, img_loc_x and img_loc_y"
         )
-    if not any(name in header for name in FRAME_COLUMNS):
+    if not any(name in header for name in _FRAMES):
         raise FileFormatError(
             f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
             f"or frame,name,x,y[,confidence], got {','.join(rows[0][1])[:60]!r}"
@@ -128,7 +132,7 @@ def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str], list[str]]:
     """
     header = rows[0][1]
     lower = [cell.lower() for cell in header]
-    frame = next(lower.index(name) for name in FRAME_COLUMNS if name in lower)
+    frame = next(lower.index(name) for name in _FRAMES if name in lower)
     known = set(lower)
 
     def is_left_out(cell: str) -> bool:

@@ -44,7 +44,7 @@ _STATES = {
        for level, word in enumerate(("none", "low", "medium", "high"))},
 }  # fmt: skip
 _BODIES = ("body", "body_id", "bodyid", "skeleton_id", "tracking_id", "trackingid", "user",
-           "user_id", "userid", "player", "player_id")  # fmt: skip
+           "user_id", "userid", "player", "player_id", "playerid")  # fmt: skip
 _PERSONS = ("person", "subject")
 
 
