@@ -433,8 +433,16 @@ def test_rows_of_several_bodies_without_a_column_that_tells(tmp_path):
     joints = to_kinect(np.stack([person(V2, 3), person(V2, 3, seed=1)], 1).reshape(6, 25, 3))
     for name, stamps in (("frame", [0, 0, 1, 1, 2, 2]), ("time", [0, 0, 0.1, 0.1, 0.2, 0.2])):
         path = write(tmp_path, "a.csv", header_text(joints, V2, {name: stamps}))
-        with pytest.raises(FileFormatError, match=f"line 3: the {name} 0 is there twice.*body_id"):
+        with pytest.raises(
+            FileFormatError, match=f"line 3: the {name} must increase, got 0 after 0.*body_id"
+        ):
             read_recording(path)
+    path = write(tmp_path, "a.csv", header_text(joints, V2, {"frame": [0, 1, 2, 0, 1, 2]}))
+    with pytest.raises(FileFormatError, match="line 5: the frame must increase, got 0 after 2"):
+        read_recording(path)
+    text = header_text(joints, V2, {"frame": [0, 1, 2, 5, 6, 7]})
+    [found] = read_recording(write(tmp_path, "a.csv", text))
+    assert found.notes == ("frames that are not in the file, by its numbers: 2, after 2",)
     text = header_text(joints, V2, {"frame": [0, 0, 1, 1, 2, 2], "player": [1, 2] * 3})
     assert len(read_recording(write(tmp_path, "a.csv", text))) == 2
 

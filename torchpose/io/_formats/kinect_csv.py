@@ -116,7 +116,7 @@ def is_row(line: str) -> bool:
     return True
 
 
-def dropped_frames(stamps: np.ndarray) -> list[str]:
+def dropped_frames(stamps: np.ndarray, by: str = "time stamps") -> list[str]:
     """Return a note on frames that the sensor left out, by steps of more than 1.5 times the median one."""
     steps = np.diff(stamps)
     if not len(steps):
@@ -127,7 +127,7 @@ def dropped_frames(stamps: np.ndarray) -> list[str]:
         return []
     count = int(np.round(ratio[after] - 1).sum())
     return [
-        f"frames that are not in the file, by its time stamps: {count}, after "
+        f"frames that are not in the file, by its {by}: {count}, after "
         f"{frame_ranges(after.tolist())}"
     ]
 
@@ -262,6 +262,8 @@ def _read_with_header(
         stamps = np.unique(_to_numbers(path, cells, [time], stamp_of)[:, time])
         fps, note = frame_rate(np.diff(stamps))
         notes += [note, *dropped_frames(stamps)] if note else []
+    elif frame is not None:
+        notes += dropped_frames(np.unique(_to_numbers(path, cells, [frame])[:, frame]), "numbers")
     known = {c for j in columns.values() for c in j.values()} | {time, frame}
     known |= {header.index(name) for name in (*_BODIES, *_PERSONS) if name in header}
     unused = [header[c] for c in range(len(header)) if c not in known]
@@ -277,7 +279,7 @@ def _read_with_header(
     clock = frame if frame is not None else time
     if body is None:
         if clock is not None:
-            _check_one_body(path, header[clock], cells, clock)
+            _check_increase(path, header[clock], cells, clock)
         return [RawRecording(path, joints, names, fps, weights=weights, **common)]
     if clock is None:
         raise FileFormatError(
@@ -307,16 +309,16 @@ def _to_numbers(
     return table
 
 
-def _check_one_body(path: Path, clock: str, rows: list[tuple[int, list[str]]], column: int) -> None:
-    """Raise unless every frame has one row, where no column tells bodies apart."""
-    before: set[str] = set()
-    for number, row in rows:
-        if row[column] and row[column] in before:
-            raise FileFormatError(
-                f"{path}, line {number}: the {clock} {row[column]} is there twice; if the rows are of "
-                f"several bodies, call the column that tells them apart body_id ({', '.join(_BODIES)})"
-            )
-        before.add(row[column])
+def _check_increase(path: Path, clock: str, rows: list[tuple[int, list[str]]], column: int) -> None:
+    """Raise unless the frames or times of rows of one body increase."""
+    stamps = _to_numbers(path, rows, [column], stamp_of)[:, column]
+    for row in np.flatnonzero(np.diff(stamps) <= 0)[:1] + 1:
+        number, cells = rows[row]
+        raise FileFormatError(
+            f"{path}, line {number}: the {clock} must increase, got {cells[column]} after "
+            f"{rows[row - 1][1][column]}; of several bodies, call the column that tells them apart body_id "
+            f"({', '.join(_BODIES)}), and of several takes, write a file for each"
+        )
 
 
 def _column_weights(
