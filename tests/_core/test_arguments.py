@@ -1,12 +1,15 @@
 """What metrics and filters refuse at the door, and that precisions are brought together."""
 
+import copy
+
 import pytest
 import torch
+from torch import nn
 
 from tests.priors.mixtures import random_mixture
 from torchpose import metrics
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.errors import InputError, ShapeError, TorchposeError
+from torchpose.errors import CovarianceError, InputError, ShapeError, TorchposeError
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
 
 
@@ -120,3 +123,41 @@ def test_points_that_are_whole_numbers_do_not_cut_the_camera_to_them():
     for project in (camera, CameraRig([camera])):
         with pytest.raises(InputError, match="floating-point"):
             project(torch.ones(2, 4, 3, dtype=torch.long))
+
+
+@pytest.mark.parametrize(
+    "held",
+    [random_mixture(3, 4), PinholeCamera(1234, 1234, 959.5, 539.5), filters()["fixed"]],
+    ids=lambda held: type(held).__name__,
+)
+def test_models_with_rounded_covariances_or_cameras_are_refused(held):
+    model = nn.ModuleDict({"held": held, "head": nn.Linear(2, 2)})
+    before = copy.deepcopy(held.state_dict())
+    with pytest.raises(
+        InputError, match=rf"{type(held).__name__} .*model\.head\.to\(torch\.bfloat16\)"
+    ):
+        model.to(torch.bfloat16)
+    torch.testing.assert_close(held.state_dict(), before, rtol=0, atol=0)
+    model.head.to(torch.bfloat16)
+    model.to("cpu").double()
+
+
+@pytest.mark.parametrize("name", filters())
+def test_filters_refuse_measurements_that_were_rounded(name):
+    with pytest.raises(
+        InputError, match=r"z must be torch\.float32 or torch\.float64, got torch\.bfloat16"
+    ):
+        filters()[name](draw(1, 3, 2, dtype=torch.bfloat16))
+
+
+@pytest.mark.parametrize(
+    "learnt", [torch.tensor([1.0, -0.5]), torch.diag(torch.tensor([1.0, -0.5]))]
+)
+def test_a_learnt_variance_that_became_negative_is_named(learnt):
+    mixture, what = (
+        random_mixture(3, 2),
+        r"-0\.5 at index \(1,\)" if learnt.ndim == 1 else "definite",
+    )
+    with pytest.raises(CovarianceError, match=f"process_cov must be positive.*{what}") as caught:
+        MixtureKalmanFilter(mixture, nn.Parameter(learnt), torch.ones(1), (0,))
+    assert "index ()" not in str(caught.value)

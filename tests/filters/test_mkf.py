@@ -442,7 +442,7 @@ def good_arguments():
     ("change", "error", "message"),
     [
         ({"process_cov": torch.ones(3)}, ShapeError, "process_cov"),
-        ({"process_cov": -torch.ones(4)}, CovarianceError, "positive definite"),
+        ({"process_cov": -torch.ones(4)}, CovarianceError, r"positive, got -1 at index \(0,\)"),
         ({"measurement_cov": torch.tensor([[1.0, 0.5], [0.0, 1.0]])}, CovarianceError, "symmetric"),
         ({"measurement_cov": torch.tensor([1.0, float("nan")])}, InputError, "finite"),
         ({"observed": [0, 4]}, InputError, r"\[0, 4\)"),
@@ -472,7 +472,7 @@ def good_arguments():
         ({"transition": "walk"}, InputError, "paper, stationary, ou"),
         ({"transition": "ou"}, InputError, "needs gamma"),
         ({"transition": "ou", "gamma": 1.0}, InputError, r"\[0, 1\)"),
-        ({"initial_cov": torch.zeros(4)}, CovarianceError, "positive definite"),
+        ({"initial_cov": torch.zeros(4)}, CovarianceError, r"positive, got 0 at index \(0,\)"),
     ],
 )
 def test_bad_models_are_refused(change, error, message):

@@ -3,6 +3,7 @@
 import copy
 import io
 import pickle
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -45,6 +46,17 @@ def other(prior):
     noise = {name: 2 * value for name, value in prior.noise.items()}
     arms = widened(prior.left, 1.5), widened(prior.right, 1.5)
     return UpperBodyPrior(*arms, replace(prior.info, name="other", cx=300.0), noise, windows)
+
+
+@pytest.fixture
+def always_warn():
+    """Warnings of PyTorch, of which most come once in a process, every time and as errors."""
+    before = torch.is_warn_always_enabled()
+    torch.set_warn_always(True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+    torch.set_warn_always(before)
 
 
 def keypoints(frames=12):
@@ -128,6 +140,23 @@ def test_given_noise_is_learnt_as_a_parameter(prior):
         with torch.no_grad():
             std -= 0.1 * std.grad.sign()
     assert values[1] < values[0]
+
+
+def test_noise_that_became_negative_is_named(prior):
+    std = nn.Parameter(torch.tensor(3.0))
+    tracker = make(prior, "windows", measurement_std=std)
+    with torch.no_grad():
+        std.fill_(-0.5)
+    with pytest.raises(InputError, match=r"got -0\.5; .*exponential of a parameter"):
+        run(tracker)
+
+
+def test_learning_the_prior_warns_of_nothing(prior, always_warn):
+    own, camera = copy.deepcopy(prior), copy.deepcopy(prior.camera)
+    for tensor in (*own.buffers(), camera.matrix):
+        tensor.requires_grad_(tensor.is_floating_point())
+    run(UpperBodyTracker(own, camera, "mkf-fixed")).joints3d.sum().backward()
+    assert own.left.means.grad.abs().sum() > 0
 
 
 @pytest.mark.parametrize("kind", METHODS)

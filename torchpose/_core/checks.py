@@ -18,6 +18,7 @@ from torchpose.errors import (
 
 MOST_CONFIDENCE = 2.0
 """Of a keypoint: peaks of heat maps may exceed 1, and count as 1; more is a score in percent."""
+STAYS_POSITIVE = "what is learnt stays positive as the exponential of a parameter"
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second
 _LARGEST_SHARE = 2.0  # of the image; joints may lie outside of it
@@ -68,7 +69,7 @@ def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: s
         bad = bad & where
     if bool(bad.any()):
         index = tuple(int(i) for i in torch.nonzero(bad)[0])
-        value = float(tensor[index])
+        value = float(tensor.detach()[index])
         count = int(bad.sum())
         message = f"{name} must be finite, got {value} at index {index} ({count} such values)"
         raise InputError(f"{message}; {hint}" if hint else message)
@@ -232,6 +233,16 @@ def check_weights(name: str, weights: Tensor) -> None:
         )
 
 
+def check_variances(name: str, variances: Tensor) -> None:
+    """Raise `CovarianceError` unless all variances are positive; NaN may pass."""
+    if values_visible() and bool((variances <= 0).any()):
+        index = tuple(torch.nonzero(variances <= 0)[0].tolist())
+        raise CovarianceError(
+            f"{name} must be positive, got {float(variances.detach()[index]):g} at index {index}; "
+            f"{STAYS_POSITIVE}"
+        )
+
+
 def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> None:
     """Raise `CovarianceError` unless every matrix is symmetric and positive definite.
 
@@ -254,16 +265,21 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
     if bool((skew > tolerance).any()):
         index = tuple(int(i) for i in torch.nonzero(skew > tolerance)[0])
         raise CovarianceError(
-            f"{name} must be symmetric, got a matrix with relative asymmetry {float(skew.max()):.2g} "
-            f"at index {index}; pass (C + C.mT) / 2 if that is what you mean"
+            f"{name} must be symmetric, got a matrix with relative asymmetry {float(skew.max()):.2g}"
+            f"{_at(index)}; pass (C + C.mT) / 2 if that is what you mean"
         )
     info = torch.linalg.cholesky_ex((covariance + covariance.mT) / 2).info
     if bool((info != 0).any()):
         index = tuple(int(i) for i in torch.nonzero(info)[0])
         raise CovarianceError(
-            f"{name} must be positive definite, got a matrix that is not at index {index}; "
+            f"{name} must be positive definite, got a matrix that is not{_at(index)}; "
             "add a small multiple of the identity or drop its dependent dimensions"
         )
+
+
+def _at(index: tuple[int, ...]) -> str:
+    """Return where a matrix is among several, for a message; nothing for a single one."""
+    return f" at index {index}" if index else ""
 
 
 def _are_covariances(matrices: Tensor, tolerance: float) -> bool:

@@ -210,6 +210,17 @@ def _is_opaque(tensor: Tensor) -> bool:
     return False
 
 
+class NoHalfModule(nn.Module):
+    """Refuses half precision, in which covariances are indefinite and cameras lose pixels.
+
+    `.half()` or `.to(torch.bfloat16)` of a model that holds it raise an `InputError`.
+    """
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        _precision_after(self, fn, torch.float32)
+        return super()._apply(fn, recurse)
+
+
 class WideModule(nn.Module):
     """Keeps the precision of its tensors, whatever `.float()` or `.to(dtype)` ask for.
 
@@ -224,9 +235,17 @@ class WideModule(nn.Module):
     dtype: torch.dtype
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        wanted = fn(torch.zeros(1, dtype=self.dtype)).dtype
-        self.dtype = working_precision("dtype", wanted)
+        self.dtype = _precision_after(self, fn, self.dtype)
         return super()._apply(in_own_precision(fn), recurse)
+
+
+def _precision_after(
+    module: nn.Module, fn: Callable[[Tensor], Tensor], dtype: torch.dtype
+) -> torch.dtype:
+    """Return the precision that `Module._apply` gives to tensors of a dtype; half precision raises."""
+    wanted = fn(torch.zeros(1, dtype=dtype)).dtype
+    other_parts = f"convert the other parts of the model by themselves, as model.head.to({wanted})"
+    return working_precision(f"precision of {type(module).__name__}", wanted, other_parts)
 
 
 def in_own_precision(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
@@ -240,8 +259,11 @@ def in_own_precision(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tenso
     return moved
 
 
-def working_precision(name: str, dtype: torch.dtype) -> torch.dtype:
+def working_precision(name: str, dtype: torch.dtype, instead: str = "") -> torch.dtype:
     """Return a dtype that filters work in.
+
+    Args:
+        name: what has it, for the message. instead: what to do, for the message.
 
     Raises:
         InputError: neither torch.float32 nor torch.float64.
@@ -249,6 +271,6 @@ def working_precision(name: str, dtype: torch.dtype) -> torch.dtype:
     if dtype not in (torch.float32, torch.float64):
         raise InputError(
             f"{name} must be torch.float32 or torch.float64, got {dtype}; half precision does not hold "
-            "covariances of pixels, metres and radians"
+            "covariances of pixels, metres and radians" + (f"; {instead}" if instead else "")
         )
     return dtype

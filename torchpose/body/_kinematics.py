@@ -6,7 +6,7 @@ quaternion vector (`torchpose.math._rotations`). Every function takes any leadin
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -314,6 +314,9 @@ class Body(nn.Module):
             [..., J, 3], metres, world axes.
         """
         return self.joints(state)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     def _points(self, state: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
         rows = rotations.transpose(-3, -2).flatten(-2)  # [..., 3, 3 P]

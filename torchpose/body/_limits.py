@@ -1,6 +1,7 @@
 """Limit joints as recorded states do: a box per part with soft edges."""
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
@@ -161,6 +162,9 @@ class JointLimits(nn.Module):
             [...], natural logarithm.
         """
         return self.log_prob(state)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     def _relative(self, state: Tensor) -> Tensor:
         wanted = _ROOT_COLUMNS + self.lower.shape[0]

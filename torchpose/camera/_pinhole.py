@@ -8,14 +8,15 @@ import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_floating, check_real
+from torchpose._core.module_state import NoHalfModule
 from torchpose.camera._camera_tables import camera_tables, check_keys, table_text
 from torchpose.camera._projection import (
     check_intrinsics,
@@ -33,7 +34,7 @@ _NOT_SQUARE = 1e-3  # by which R R^T may differ from the identity
 FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a webcam
 
 
-class PinholeCamera(nn.Module):
+class PinholeCamera(NoHalfModule):
     """Holds a calibrated camera: K in pixels and, if it is known, its pose in the room.
 
     Args:
@@ -268,6 +269,9 @@ class PinholeCamera(nn.Module):
         check_floating("points", points)
         K, R, t = (m.to(points) for m in (self.matrix, self.rotation_matrix, self.translation))
         return project(points, K, R, t)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     def extra_repr(self) -> str:
         fx, fy, _, cx, cy = (float(e) for e in intrinsics(self.matrix))

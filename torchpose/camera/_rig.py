@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -127,6 +127,9 @@ class CameraRig(nn.Module):
         homogeneous = points.unsqueeze(-3) @ (K @ R).mT + (K @ t.unsqueeze(-1)).mT
         depth = homogeneous[..., 2]
         return RigView(homogeneous[..., :2] / depth.unsqueeze(-1), depth)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     def select(self, index: Sequence[int]) -> "CameraRig":
         """Return the rig of some of the cameras, in the given order.

@@ -12,6 +12,8 @@ from torchpose._core.checks import (
     check_floating,
     check_real,
     check_shape,
+    check_variances,
+    refuse_half,
 )
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError, ShapeError
@@ -63,6 +65,7 @@ def check_values(
         ShapeError, InputError: what does not fit.
     """
     check_floating("z", z)
+    refuse_half("z", z)
     check_shape("z", z, ["B", "T", n_observed])
     batch, n_frames = z.shape[:2]
     if batch == 0 or n_frames == 0:
@@ -132,6 +135,7 @@ def as_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> Tens
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.ndim == trailing - 1:
         check_shape(name, value, ["...", dim])
+        check_variances(name, value)
         value = torch.diag_embed(value)
     check_shape(name, value, ["...", dim, dim])
     if value.ndim != trailing:

@@ -6,7 +6,7 @@ implements `init` and `filter_frame`; shapes, masks, lengths and failures are ha
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Integer
@@ -294,6 +294,9 @@ class RecursiveFilter(WideModule, ABC):
         with one_run(self.observed.device):
             frames = self.check(z, mask, measurement_cov, lengths, generator)
             return self.filter_frames(frames, generator, return_cov, progress)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     @takes_former_arguments
     def smooth(

@@ -1,7 +1,7 @@
 """Measure head and neck from the face (BL section 5), and detect hands in front of faces."""
 
 from functools import cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -108,6 +108,9 @@ class HeadNeck(nn.Module):
             slope[:, :, 2] = self.offset
             cov = cov + slope @ face_cov.to(faces)[:, None] @ slope.mT
         return centre + size * self.offset, cov
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
 
 def head_part(per_cell: int) -> tuple[slice, slice]:

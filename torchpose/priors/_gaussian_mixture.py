@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ from torchpose._core.checks import (
     check_shape,
     check_weights,
 )
-from torchpose._core.module_state import register_given
+from torchpose._core.module_state import NoHalfModule, register_given
 from torchpose.errors import InputError, ShapeError
 from torchpose.math._gaussian import mixture_moments, symmetrise
 from torchpose.math._mixture_em import FitReport, MixtureParameters, expectation_maximisation
@@ -81,7 +81,7 @@ def component_log_density(
     return log_density.reshape(*x.shape[:-1], k).to(dtype)
 
 
-class GaussianMixture(nn.Module):
+class GaussianMixture(NoHalfModule):
     """Holds a mixture of K Gaussians with full covariances over D dimensions.
 
     p(x) = sum_k pi_k N(x; mu_k, Sigma_k)
@@ -282,6 +282,9 @@ class GaussianMixture(nn.Module):
             [...], natural logarithm.
         """
         return self.log_prob(x)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     def moments(self) -> tuple[Float[Tensor, " D"], Float[Tensor, "D D"]]:
         """Return the mean and covariance of the whole mixture."""

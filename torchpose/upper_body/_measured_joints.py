@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import (
+    STAYS_POSITIVE,
     check_covariance,
     check_finite,
     check_floating,
@@ -83,8 +84,8 @@ def pixels_per_metre(prior: UpperBodyPrior) -> float:
     info = prior.info
 
     def make() -> float:
-        depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
-        return math.sqrt(info.fx * info.fy) / depth
+        depth = (prior.left.moments()[0][14] + prior.right.moments()[0][14]).detach() / 2
+        return math.sqrt(info.fx * info.fy) / float(depth)
 
     sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple())
     return derived(prior, ("pixels per metre", info.fx, info.fy), sources, make)
@@ -426,7 +427,9 @@ def joint_covariances(
     check_shape("measurement_std", by_joint, [5])
     check_finite("measurement_std", by_joint)
     if bool((by_joint <= 0).any()):
-        raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
+        raise InputError(
+            f"measurement_std must be positive, got {given.tolist()}; {STAYS_POSITIVE}"
+        )
     cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
     if learnt is None:
         cov = map_pixel_covariance(cov, matrix, prior.info.matrix)

@@ -161,7 +161,7 @@ def screen_model(
     """
     corners = _corners(prior, camera, like)
     size, middle = (corners[1] - corners[0]).abs(), corners.mean(0)
-    outlier = math.log(OUTLIERS / (1 - OUTLIERS)) - float((_ENLARGED * size).log().sum())
+    outlier = math.log(OUTLIERS / (1 - OUTLIERS)) - float((_ENLARGED * size).detach().log().sum())
     dt, scale = 1.0 / fps, pixels_per_metre(prior)
     kept = math.exp(-dt / _PERSISTENCE)
     drift = _PERSISTENCE * (1 - kept)
@@ -176,7 +176,7 @@ def screen_model(
     start = like.new_tensor([1 - BRISK, BRISK]).log() - outlier - math.log(2 * math.pi)
     return ScreenModel(
         dt, scale, middle - _ENLARGED / 2 * size, middle + _ENLARGED / 2 * size,
-        float(size.amax() / 2) ** 2, start,
+        float(size.detach().amax() / 2) ** 2, start,
         like.new_tensor(moving), drift, kept, speed.square()[:, None] * grown,
         (brisk * dt).square(), like.new_tensor([1.0, 1 / dt, 1 / dt**2]), speed.square(), log_scales,
         (-(log_scales / _SCALE_SPREAD).square() / 2).log_softmax(0),

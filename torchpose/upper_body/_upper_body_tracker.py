@@ -1,7 +1,7 @@
 """Track upper bodies: from 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Integer
@@ -303,6 +303,9 @@ class UpperBodyTracker(WideModule):
             )
             _, track = reader.read(None, estimates, found, lengths)
         return note_collapse(track.in_precision(self.dtype))
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     @uncompiled
     def init(

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple, Self, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, Unpack
 
 import numpy as np
 import torch
@@ -328,6 +328,9 @@ class VideoTracker(nn.Module):
                     for _ in block.found:
                         watch(block.images[-1], block.found[-1], dict(state.poses))
         return recording.finish(self.smoother)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[tuple[Image, int]]:
         """Return images, and how many frames were missed before each, once their rate is known."""

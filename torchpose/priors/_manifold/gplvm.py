@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -307,6 +307,9 @@ class BackConstrainedGPLVM(nn.Module):
             ShapeError: another number of columns.
         """
         return self.to_pose(self.to_latent(x))
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     # --- what it is
 

@@ -6,7 +6,7 @@ next. Batches, empty silhouettes, dead particles and the loop over time are hand
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float, Int
@@ -181,6 +181,9 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         state = self.init(start, generator=generator, initial_cov=initial_cov)
         track = self._run(state, frames, cameras, generator, lengths, progress)[1]
         return track if batched else track.element(0)
+
+    if TYPE_CHECKING:  # nn.Module has Any
+        __call__ = forward
 
     @takes_former_arguments
     @torch.no_grad()
