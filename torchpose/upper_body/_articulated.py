@@ -50,6 +50,7 @@ from torchpose.upper_body._lean import lean_angle, roll, seen_lean
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._root_grid import Moments, RootGrid
+from torchpose.upper_body._seen_size import SeenSize, follow_size
 from torchpose.upper_body._torso_likelihood import Root
 
 _SHARE = 0.2  # seconds over which frames say the same about lengths
@@ -65,6 +66,7 @@ class ArticulatedState(NamedTuple):
     Attributes:
         root: the belief over size, depth and turn of the torso at its last update, [B, S, Z, P].
         roots: the hypotheses about these of that update; None before the first frame.
+        seen_size: how large the torso was seen at the updates so far.
         moments: the moments of the belief over these. lengths: the belief over the lengths of the bones.
         sizes: the lengths themselves. arms: the belief over the arms; None before the first frame.
         middle: the middle of the shoulders, camera axes, [B, 3]; on the optical axis before any of the
@@ -79,6 +81,7 @@ class ArticulatedState(NamedTuple):
 
     root: Tensor
     roots: Roots | None
+    seen_size: SeenSize
     moments: Moments
     lengths: Lengths
     sizes: Sizes
@@ -217,8 +220,9 @@ class ArticulatedFilter(Estimator):
         lean = root.new_zeros(batch_size, 2)
         starts = torch.full((batch_size,), self.starts, device=root.device)
         tilt = roll(lean_angle(lean))
+        size = SeenSize.unknown(batch_size, root)
         return ArticulatedState(
-            root, None, moments, lengths, sizes, None, middle, lean, tilt, 0, starts
+            root, None, size, moments, lengths, sizes, None, middle, lean, tilt, 0, starts
         )
 
     def advance(
@@ -289,11 +293,14 @@ class ArticulatedFilter(Estimator):
         last = (state.middle[:, None] @ tilt)[:, 0]
         tilted = upright(frame, facts, tilt)
         # the torso: one hypothesis of the root, the mean of those near the likeliest
-        belief, roots, starts = state.root, state.roots, state.starts
+        belief, roots, size, starts = state.root, state.roots, state.seen_size, state.starts
         if roots is None or due:
             power = torch.full_like(last[:, 0], 1.0 if roots is None else self.power)
             power = power if fresh is None else power.masked_fill(fresh, 1.0)
-            belief, roots, fits = self.root.weigh(belief, tilted, last, sizes, power, fresh)
+            size, farther = follow_size(size, tilted.torso, self.every / self.model.rate)
+            belief, roots, fits = self.root.weigh(
+                belief, tilted, last, sizes, power, fresh, _some(farther)
+            )
             if starts is not None and fresh is not None and fits is not None:
                 left = (starts - 1).masked_fill(fits, 0)
                 starts = _some(torch.where(fresh, left, starts))
@@ -321,7 +328,7 @@ class ArticulatedFilter(Estimator):
         )  # fmt: skip
         middle = (middle @ tilt.mT)[:, 0]
         after = ArticulatedState(
-            belief, roots, moments, learnt, sizes, posterior, middle, lean, tilt, state.frame + 1,
+            belief, roots, size, moments, learnt, sizes, posterior, middle, lean, tilt, state.frame + 1,
             starts,
         )  # fmt: skip
         return _Step(after, seen, posterior)
@@ -344,8 +351,8 @@ class ArticulatedFilter(Estimator):
         moments = self.grid.moments(root)
         lengths = self.lengths.init(len(chosen), moments.of_size)
         begun = {
-            "root": root, "moments": moments, "lengths": lengths,
-            "sizes": self.lengths.sizes(lengths), "lean": torch.zeros_like(state.lean),
+            "root": root, "seen_size": SeenSize.unknown(len(chosen), root), "moments": moments,
+            "lengths": lengths, "sizes": self.lengths.sizes(lengths), "lean": torch.zeros_like(state.lean),
         }  # fmt: skip
         fields = {name: _where(chosen, new, getattr(state, name)) for name, new in begun.items()}
         return state._replace(**fields)

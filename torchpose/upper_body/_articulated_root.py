@@ -83,6 +83,7 @@ class RootStep(NamedTuple):
         sizes: Sizes,
         power: Float[Tensor, " B"],
         fresh: Bool[Tensor, " B"] | None,
+        farther: Float[Tensor, " B"] | None,
     ) -> tuple[Float[Tensor, "B S Z P"], Roots, Bool[Tensor, " B"] | None]:
         """Return the posterior over the grid, the likeliest hypotheses, and whether arms that are fresh fit.
 
@@ -92,9 +93,10 @@ class RootStep(NamedTuple):
             sizes: the lengths of the bones. power: the exponent of the likelihood.
             fresh: whose body starts with this frame, so that the depths at which its arms cannot be are
                 ruled out before the likeliest hypotheses are picked; None is nobody.
+            farther: the log of the factor on the depth since then; None is 0 for everybody.
         """
         likelihood = self.grid.likelihood(frame.torso, sizes.torso, power)
-        believed = self.grid.predict(belief) * likelihood
+        believed = self.grid.predict(belief, farther) * likelihood
         if frame.face is not None:
             std = frame.given.std.amin(1)
             of_face = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)

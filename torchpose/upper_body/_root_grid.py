@@ -89,12 +89,20 @@ class RootGrid:
         belief = sizes[:, None, None] * self.prior
         return belief.expand(batch_size, *belief.shape)
 
-    def predict(self, belief: Float[Tensor, "B S Z P"]) -> Float[Tensor, "B S Z P"]:
+    def predict(
+        self, belief: Float[Tensor, "B S Z P"], farther: Float[Tensor, " B"] | None = None
+    ) -> Float[Tensor, "B S Z P"]:
         """Return the predicted belief of the next frame: a random walk mixed with a restart from the prior.
 
         The size stays; a share of 1e-6 of the belief restarts from the prior over depth and turn.
+
+        Args:
+            belief: the belief of the frame before. farther: the log of the factor on the depth since then
+                (`follow_size`); None is 0 for everybody.
         """
         moved = _diffused(belief, self._along) @ self._round
+        if farther is not None:
+            moved = _shifted(moved, farther / _DEPTH_STEP)
         anew = belief.sum((-2, -1), keepdim=True)
         return torch.addcmul(moved, anew, self.prior, value=_LOST)
 
@@ -231,6 +239,16 @@ def _share_that_moves(std: float, step: float) -> float:
     second: 39 degrees after one second.
     """
     return min(0.5 * (std / step) ** 2, 1 / 3)
+
+
+def _shifted(
+    belief: Float[Tensor, "B S Z P"], steps: Float[Tensor, " B"]
+) -> Float[Tensor, "B S Z P"]:
+    """Return the belief moved by so many steps of depth, linearly between cells; the ends keep theirs."""
+    rows = torch.arange(belief.shape[2], device=steps.device).to(steps)
+    to = (rows + steps[:, None]).clamp(0, len(rows) - 1)
+    share = (1 - (rows[:, None] - to[:, None]).abs()).clamp_min(0.0)
+    return share[:, None] @ belief
 
 
 def _diffused(belief: Float[Tensor, "B S Z P"], share: float) -> Float[Tensor, "B S Z P"]:
