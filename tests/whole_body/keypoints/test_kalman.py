@@ -77,11 +77,15 @@ def test_smoothing_is_nearer_and_surer(four, filtered):
     torch.testing.assert_close(smoothed.joints3d[-1], filtered.joints3d[-1])
 
 
+def share_in_ellipsoids(track, joints):
+    """The share of joints in 90 % ellipsoids."""
+    away = track.joints3d - joints
+    solved = torch.linalg.solve(track.covariance3d, away[..., None]).squeeze(-1)
+    return float(((away * solved).sum(-1) < 6.251).double().mean())
+
+
 def test_ellipsoids_hold_what_they_say(four, filtered):
-    away = filtered.joints3d - four.joints
-    solved = torch.linalg.solve(filtered.covariance3d, away[..., None]).squeeze(-1)
-    inside = ((away * solved).sum(-1) < 6.251).double().mean()
-    assert 0.75 < float(inside) < 0.995
+    assert 0.75 < share_in_ellipsoids(filtered, four.joints) < 0.995
 
 
 def test_bones_become_those_of_the_person():
@@ -195,8 +199,9 @@ def test_a_person_who_went_away_is_found_elsewhere(four):
     assert float(errors(found, joints)[-1].mean()) < 0.03
 
 
-@pytest.mark.parametrize("smoothing", ["none", "full"])
-def test_who_was_away_for_a_second_and_turned_is_right_at_once(smoothing):
+@pytest.fixture(scope="module")
+def returning():
+    """Who is away in frames 15 to 45 and returns turned, in two cameras."""
     given = scene(2, 56)
     c, s = math.cos(2.6), math.sin(2.6)
     turn = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float64)
@@ -204,10 +209,27 @@ def test_who_was_away_for_a_second_and_turned_is_right_at_once(smoothing):
     joints[46:] = joints[46:] @ turn.mT + torch.tensor([0.6, 0.0, -0.4])
     keypoints = given.rig(joints).pixels
     keypoints[15:46] = torch.nan
-    found = track(given._replace(keypoints=keypoints), smoothing)
+    return given._replace(joints=joints, keypoints=keypoints)
+
+
+@pytest.mark.parametrize("smoothing", ["none", "full"])
+def test_who_was_away_for_a_second_and_turned_is_right_at_once(returning, smoothing):
+    found = track(returning, smoothing)
     assert found.coasting.nonzero().flatten().tolist() == list(range(15, 46))
     assert found.respread.nonzero().flatten().tolist() == [46]
-    assert float(errors(found, joints)[46:].mean(-1).max()) < 0.03
+    assert float(errors(found, returning.joints)[46:].mean(-1).max()) < 0.03
+
+
+def test_one_camera_sees_who_was_away_for_a_second_as_for_the_first_time(returning):
+    one = returning._replace(
+        rig=returning.rig.select([0]),
+        keypoints=returning.keypoints[:, :1],
+        confidence=returning.confidence[:, :1],
+    )
+    found = track(one, "full")
+    assert found.respread[46]
+    anew = one._replace(keypoints=one.keypoints[46:], confidence=one.confidence[46:])
+    torch.testing.assert_close(found.joints3d[46:], track(anew, "full").joints3d)
 
 
 @pytest.mark.parametrize("smoothing", ["none", "full"])

@@ -63,7 +63,7 @@ LEAST_JOINTS = 6  # that are measured where tracking begins
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
-_AWAY = 0.5  # of a lost frame counts one in which several cameras see nobody: a second until a new start
+_AWAY = 0.5  # of a lost frame counts one in which nobody is seen: a second until a new start
 
 
 class KeypointTracker(nn.Module):
@@ -207,6 +207,8 @@ class KeypointTracker(nn.Module):
             unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
             stream = stream._replace(spread=spread, unseen=unseen)
         stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
+        if lifted is not None:
+            stream = stream._replace(memory=self._recalled(stream, frame))
         return stream, self._posed(stream, found, due), found
 
     def _posed(
@@ -381,6 +383,15 @@ class KeypointTracker(nn.Module):
         lifted, memory = self.lifter(frame, None if stream is None else stream.memory)
         return memory, lifted
 
+    def _recalled(self, stream: KeypointStream, frame: KeypointFrame) -> Float[Tensor, "B L W"]:
+        """Return the state of the recurrent network, that of a beginning where nobody has been seen for long.
+
+        Otherwise it would lift somebody who returns to the pose of who left for half a second.
+        """
+        nobody = ~(frame.inlier > 0).flatten(1).any(-1)
+        gone = nobody & (stream.lost > _LOST_TIME * self.filter.fps)
+        return stream.memory.masked_fill(gone[:, None, None], 0.0)
+
     def _no_memory(self, frame: KeypointFrame) -> Float[Tensor, "B L W"]:
         """Return the state of the recurrent network before the first frame."""
         return torch.zeros(len(frame.inlier), *MEMORY, device=frame.inlier.device)
@@ -432,9 +443,8 @@ class KeypointTracker(nn.Module):
         """Return for how many frames in a row keypoints have been of something else, or of the other side.
 
         A camera that seems to exchange sides counts half: detectors do so for moments, and where it goes on,
-        it is the body that has them the wrong way round. Frames without any keypoint count half, too, of
-        several cameras: a prediction over more than a second is too wide to be corrected. In one camera the
-        network tells where the prediction is wrong.
+        it is the body that has them the wrong way round. Frames without any keypoint count half, too: a
+        prediction over more than a second is too wide to be corrected.
         """
         expected = frame.inlier.sum((-2, -1))
         found = weighed.inlier.sum((-2, -1))
@@ -443,8 +453,7 @@ class KeypointTracker(nn.Module):
         astray = (found < _LOST * expected) | turned
         lost = torch.where(astray, grown, 0.0)
         lost = torch.where(stream.begun, lost, stream.lost + 1)
-        away = stream.begun.to(lost) * (_AWAY if self.lifter is None else 0.0)
-        return torch.where(expected > 0, lost, stream.lost + away)
+        return torch.where(expected > 0, lost, stream.lost + _AWAY * stream.begun.to(lost))
 
     # --- whole sequences --------------------------------------------------------------------------
 
