@@ -88,6 +88,12 @@ def test_ellipsoids_hold_what_they_say(four, filtered):
     assert 0.75 < share_in_ellipsoids(filtered, four.joints) < 0.995
 
 
+def test_noise_of_keypoints_is_told_within_a_second():
+    """It is three times the usual one, and without that ellipsoids hold a third of the joints."""
+    given = scene(3, 30, noise=12.0)
+    assert share_in_ellipsoids(track(given), given.joints) > 0.65
+
+
 def test_bones_become_those_of_the_person():
     tall = scene(4, 50, height=1.95)
     found = track(tall)

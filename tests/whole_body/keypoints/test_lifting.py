@@ -103,7 +103,7 @@ def state_of(motion):
     scales = body.columns["scales"]
     cov[scales, scales] *= 1e-6
     new = point.position.new_zeros
-    return filter, BodyGaussian(point, cov[None], new(1, 2, 2), new(1, 2), new(1, 15))
+    return filter, BodyGaussian(point, cov[None], new(1, 2, 2), new(1, 2), new(1, 15), new(1, 2))
 
 
 def lifted_from(joints, std, off=(0.0, 0.0, 0.0)):

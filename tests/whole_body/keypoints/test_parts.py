@@ -103,7 +103,10 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     root = torch.randn(body.dim, body.dim, generator=generator, dtype=torch.float64)
     cov = (root @ root.mT * 1e-3 + 1e-3 * torch.eye(body.dim, dtype=torch.float64))[None]
     new = point.position.new_full
-    state = BodyGaussian(point, cov, new((1, 3, 2), -50.0), new((1, 3), 1.0), new((1, 15), -5.0))
+    of_cameras = new((1, 3), 1.0)
+    state = BodyGaussian(
+        point, cov, new((1, 3, 2), -50.0), of_cameras, new((1, 15), -5.0), of_cameras
+    )
     frame = frame_of(given)
     found = BodyKalmanFilter(motion, given.rig, 30.0).correct(state, frame, (1.0,))
 

@@ -60,13 +60,18 @@ from torchpose.whole_body._keypoints.upright import Upright, upright_of
 FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
 
+SCALE_TIMES = (0.1, 2.0)
+"""Seconds of keypoints that the usual noise of a camera counts for, and over which the noise is averaged.
+
+In one camera the usual noise counts for the longer time: its scale depends on what the network lifts.
+"""
+
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
-_SCALE_TIME = 2.0  # seconds over which they are estimated
 _WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of the noise that are tried for cameras with few inliers
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
 
@@ -78,6 +83,7 @@ class BodyGaussian(NamedTuple):
         mean: points, [B]. cov: [B, N, N], in the tangent spaces of the means.
         log_odds: [B, C, 2], of exchanged sides of arms and legs. scale: [B, C], of the cameras' noise.
         doubt: [B, J], log-odds of a joint elsewhere than the prediction has it.
+        told: [B, C], number of frames that told the scale.
     """
 
     mean: BodyPoint
@@ -85,6 +91,7 @@ class BodyGaussian(NamedTuple):
     log_odds: Tensor
     scale: Tensor
     doubt: Tensor
+    told: Tensor
 
     @property
     def beliefs(self) -> Beliefs:
@@ -181,7 +188,8 @@ class BodyKalmanFilter(nn.Module):
         mean = self.articulation.moved(state.mean, model.step(self.articulation, state.mean))
         cov = model.matrix @ state.cov @ model.matrix.mT + model.noise
         log_odds, doubt = model.next_log_odds(state.log_odds), model.next_doubt(state.doubt)
-        return self.pulled(BodyGaussian(mean, cov, log_odds, state.scale, doubt), model.share)
+        later = state._replace(mean=mean, cov=cov, log_odds=log_odds, doubt=doubt)
+        return self.pulled(later, model.share)
 
     def pulled(self, state: BodyGaussian, share: float) -> BodyGaussian:
         """Return the Gaussian after a share of the information of the priors over poses and leans."""
@@ -317,12 +325,14 @@ class BodyKalmanFilter(nn.Module):
         weighed = weigh(readings, seen, self.maps, state.beliefs, self.exchange)
         off = (step.pulled * (G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
         fit = -0.5 * off - step.chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        scale, told = self._next_scale(state, readings, seen, weighed, joint_cov)
         after = BodyGaussian(
             a.swung(point, joints),
             (cov + cov.mT) / 2,
             torch.logit(weighed.exchanged, _ODDS),
-            self._next_scale(state.scale, readings, seen, weighed, joint_cov),
+            scale,
             state.doubt,
+            told,
         )
         evidence = weighed.log_evidence + fit
         return CorrectedBody(
@@ -331,27 +341,29 @@ class BodyKalmanFilter(nn.Module):
 
     def _next_scale(
         self,
-        scale: Tensor,
+        state: BodyGaussian,
         readings: KeypointFrame,
         seen: Seen,
         weighed: Weighed,
         joint_cov: Tensor,
-    ) -> Float[Tensor, "B C"]:
-        """Return the factors of the cameras' noise, averaged over the last seconds."""
+    ) -> tuple[Float[Tensor, "B C"], Float[Tensor, "B C"]]:
+        """Return the factors of the cameras' noise, averaged over seconds, and how many frames told them."""
         sums, count = squared_errors(readings, seen, weighed, joint_cov)
         if len(self.maps.shift) > 2:  # of two cameras nothing tells which is wrong
             least = FEW_INLIERS * readings.inlier[0].sum(-1)
             few = (weighed.inlier.sum(-1) < least).any(-1, keepdim=True)
             if bool(few.any()):
-                beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), scale)
+                beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), state.scale)
                 wider = self._by_wider(readings, seen, beliefs, joint_cov)
                 sums, count = (
                     torch.where(few, wide, own)
                     for wide, own in zip(wider, (sums, count), strict=True)
                 )
-        share = (count / _SCALE_COUNT).clamp_max(1) / (_SCALE_TIME * self.fps)
+        tells = (count / _SCALE_COUNT).clamp_max(1)
+        told = (state.told + tells).clamp_max(SCALE_TIMES[1] * self.fps)
         ratio = sums / count.clamp_min(1e-6)
-        return (scale * (1 + share * (ratio - 1))).clamp(*NOISE_SCALES)
+        scale = state.scale * (1 + tells / told * (ratio - 1))
+        return scale.clamp(*NOISE_SCALES), told
 
     def _by_wider(
         self, readings: KeypointFrame, seen: Seen, beliefs: Beliefs, joint_cov: Tensor

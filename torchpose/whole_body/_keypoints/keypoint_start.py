@@ -18,6 +18,7 @@ from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
     FEW_INLIERS,
+    SCALE_TIMES,
     BodyGaussian,
     BodyKalmanFilter,
     CorrectedBody,
@@ -112,12 +113,13 @@ def _begun(
     points = _points(body, motion, maps, joints, n_headings)
     joints, known = (value.repeat_interleave(n_headings, 0) for value in (joints, known))
     points = body.swung(points, joints, known)
-    return filter.pulled(_state(points, _initial_cov(motion), maps), 1.0)
+    return filter.pulled(_state(points, _initial_cov(motion), maps, filter.fps), 1.0)
 
 
-def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps) -> BodyGaussian:
+def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps, fps: float) -> BodyGaussian:
     """Return Gaussians about points; nothing is known of cameras."""
     count, n_cameras = len(points.position), len(maps.shift)
+    told = SCALE_TIMES[0 if n_cameras > 1 else 1] * fps
     new = points.position.new_full
     return BodyGaussian(
         points,
@@ -125,6 +127,7 @@ def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps) -> BodyG
         new((count, n_cameras, 2), _LOG_ODDS),
         new((count, n_cameras), 1.0),
         new((count, len(BODY_15.names)), _DOUBT),
+        new((count, n_cameras), told),
     )
 
 

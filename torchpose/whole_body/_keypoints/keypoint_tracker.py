@@ -321,6 +321,7 @@ class KeypointTracker(nn.Module):
         state = by_one.state._replace(
             log_odds=into_all(found.state.log_odds, by_one.state.log_odds, camera),
             scale=into_all(found.state.scale, by_one.state.scale, camera),
+            told=into_all(found.state.told, by_one.state.told, camera),
         )
         alone = torch.full_like(stream.alone, camera)
         lost = after.lost

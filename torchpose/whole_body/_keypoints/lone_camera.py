@@ -40,7 +40,10 @@ def frame_of(frame: KeypointFrame, camera: int, widening: float) -> KeypointFram
 
 def state_of(state: BodyGaussian, camera: int) -> BodyGaussian:
     """Return Gaussians with what is believed of one camera."""
-    return state._replace(log_odds=state.log_odds[:, [camera]], scale=state.scale[:, [camera]])
+    log_odds, scale, told = (
+        value[:, [camera]] for value in (state.log_odds, state.scale, state.told)
+    )
+    return state._replace(log_odds=log_odds, scale=scale, told=told)
 
 
 def into_all(
