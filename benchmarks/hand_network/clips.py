@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from benchmarks._data import data_files
 from benchmarks._performances import performance
@@ -18,7 +18,7 @@ from torchpose._core.reading import read_npz
 from torchpose.demo import demo_camera
 from torchpose.demo._rendering import render_video
 from torchpose.measure import HandTracker, UpperBodyMeasurer
-from torchpose.measure._body_window import CELLS, pixels_to_cells
+from torchpose.measure._body_window import CELLS, halve, pixels_to_cells
 from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
 from torchpose.measure._hand_network import HandNetwork, HandPlaces, shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
@@ -121,7 +121,7 @@ class _Recorder(HandNetwork):
         seen: Tensor | None = None,
     ) -> HandPlaces:
         """Return an even density of hands that are seen."""
-        self.asked = lab, torch.cat([maps, inside[:, None]], 1), faces
+        self.asked = lab, torch.cat([maps, halve(inside)[:, None]], 1), faces
         even, sure = maps.new_zeros(len(maps), 2, *CELLS), maps.new_full((len(maps), 2), -20.0)
         return HandPlaces(even, sure, even, sure)
 
@@ -257,6 +257,5 @@ def windows_of(clip: Clip) -> Windows:
     for t, row, _, anchor in measure(clip, tracker):
         lab, maps, faces = (x[row : row + 1] for x in recorder.asked)
         place = pixels_to_cells(clip.labels.centres[t][None], anchor[None])
-        small = nn.functional.avg_pool2d(maps, 2)
-        rows.append((lab, small.half(), faces, place.float(), clip.labels.seen[t][None]))
+        rows.append((lab, maps.half(), faces, place.float(), clip.labels.seen[t][None]))
     return Windows(*(torch.cat(column) for column in zip(*rows, strict=True)))

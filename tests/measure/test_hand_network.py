@@ -13,6 +13,7 @@ from torchpose.measure._body_window import (
     CELLS,
     cell_centres,
     cells_to_pixels,
+    halve,
     pixels_to_cells,
 )
 from torchpose.measure._hand_layers import for_inference
@@ -33,14 +34,14 @@ PERSON = [(320.0, 120.0, 76.0)]
 def windows(count=1, seed=0):
     generator = torch.Generator().manual_seed(seed)
     lab = torch.randint(0, 255, (count, 3, 176, 192), dtype=torch.uint8, generator=generator)
-    maps = torch.rand(count, 3, 176, 192, generator=generator)
+    maps = torch.rand(count, 3, *CELLS, generator=generator)
     return lab, maps, torch.ones(count, 176, 192), FACE.expand(count, -1)
 
 
 def inputs(count=1):
     """Return what the network itself takes: relative colours, maps of coarse cells, faces."""
     lab, maps, inside, faces = windows(count)
-    every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
+    every = halve(torch.cat([maps, halve(inside)[:, None]], 1))
     return relative_colours(lab, faces), every, faces
 
 

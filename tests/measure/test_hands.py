@@ -299,8 +299,8 @@ def test_half_the_frame_rate(prior, clip):
 def test_the_likelihood_prefers_the_end_of_a_bare_forearm():
     """Skin from the elbow at the top to the fingers: the cue is what lies beyond."""
     likelihood = HandLikelihood()
-    skin, still = torch.zeros(1, 2 * CELLS[0], 2 * CELLS[1]), torch.zeros(1, 2, *CELLS)
-    skin[:, 60:110, 92:98] = 1.0  # 2.5 B long, 0.3 B wide
+    skin, still = torch.zeros(1, 1, *CELLS), torch.zeros(1, 2, *CELLS)
+    skin[..., 30:55, 46:49] = 1.0  # 2.5 B long, 0.3 B wide
     elbow = torch.zeros(1, 2, 2, *CELLS)
     elbow[:, :, 1] = 0.6  # above everything, in B from the anchor
     score = likelihood(likelihood.means(skin, still), likelihood.shape_places(elbow))[0, 0]

@@ -115,7 +115,8 @@ def cut_colours(
 ]:
     """Return the windows in Lab, bytes [N, 3, 176, 192], the same smoothed, a finer part [N, 3, p, q], gains.
 
-    By OpenCV, for one person after the other, as in `cut_windows`. A window that is dark, its face
+    By OpenCV, for one person after the other, as in `cut_windows`. The colours of a pixel of the first lie
+    side by side, as the network reads them fastest. A window that is dark, its face
     included, is multiplied by its gain [N], which is 1 for all others.
 
     Args:
@@ -125,20 +126,19 @@ def cut_colours(
     import cv2
 
     height, width = CELLS[0] * EVIDENCE, CELLS[1] * EVIDENCE
-    labs = np.empty((len(anchors), 3, height, width), np.uint8)
-    smooth = np.empty(labs.shape, np.float32)
-    parts = np.empty((*labs.shape[:2], *(side.stop - side.start for side in part)), np.uint8)
+    labs = np.empty((len(anchors), height, width, 3), np.uint8)
+    smooth = np.empty((len(anchors), 3, height, width), np.float32)
+    parts = np.empty((*smooth.shape[:2], *(side.stop - side.start for side in part)), np.uint8)
     gains = np.ones(len(anchors))
     for n, window in enumerate(cut_windows(frame, anchors)):
         gains[n] = gain_to(_DARK, _brightest(window))
         window = brightened(window, gains[n])
         small = cv2.resize(window, (width, height), interpolation=cv2.INTER_AREA)
-        lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-        cv2.split(lab, [*labs[n]])
-        cv2.split(cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8), [*smooth[n]])
+        cv2.cvtColor(small, cv2.COLOR_RGB2LAB, dst=labs[n])
+        cv2.split(cv2.GaussianBlur(labs[n].astype(np.float32), (0, 0), 0.8), [*smooth[n]])
         cv2.split(cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB), [*parts[n]])
-    colours = torch.from_numpy(labs), torch.from_numpy(smooth), torch.from_numpy(parts)
-    return *colours, torch.from_numpy(gains)
+    lab = torch.from_numpy(labs).permute(0, 3, 1, 2)
+    return lab, torch.from_numpy(smooth), torch.from_numpy(parts), torch.from_numpy(gains)
 
 
 def _brightest(window: Image) -> float:
@@ -225,6 +225,22 @@ def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
     x = _LEFT + (torch.arange(columns, dtype=torch.float32) + 0.5) * (CELL / per_cell)
     y = _TOP + (torch.arange(rows, dtype=torch.float32) + 0.5) * (CELL / per_cell)
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
+
+
+def part_of_window(
+    low: Float[Tensor, "N 2"], high: Float[Tensor, "N 2"], per_cell: int
+) -> tuple[slice, slice]:
+    """Return the rows and columns of maps of a window that hold all boxes, as far as they lie in it.
+
+    Args:
+        low, high: corners (x, y) of the boxes, in B from the anchors.
+        per_cell: pixels of the maps for each cell.
+    """
+    first, per_b = low.new_tensor([_LEFT, _TOP]), per_cell / CELL
+    start = ((low.amin(0) - first) * per_b).floor().int().clamp_min(0).tolist()
+    stop = ((high.amax(0) - first) * per_b).ceil().int().clamp_min(0).tolist()
+    columns, rows = (slice(*ends) for ends in zip(start, stop, strict=True))
+    return rows, columns
 
 
 @cache

@@ -13,7 +13,7 @@ from torchpose._core.checks import check_finite, check_rgb, check_shape
 from torchpose._core.images import Image
 from torchpose._core.module_state import outside_inference
 from torchpose.errors import InputError
-from torchpose.measure._body_window import CELL, CELLS, cell_centres, halve
+from torchpose.measure._body_window import CELL, CELLS, cell_centres
 from torchpose.measure._face_detector import check_faces
 
 # turns (y, x) into the vector across
@@ -83,21 +83,20 @@ class HandLikelihood(nn.Module):
     hand_columns: Tensor
 
     def means(
-        self, skin: Float[Tensor, "N h w"], motion: Float[Tensor, "N 2 r c"]
+        self, skin: Float[Tensor, "N 1 r c"], motion: Float[Tensor, "N 2 r c"]
     ) -> Float[Tensor, "N 4 r c"]:
         """Return means about the centre of every cell: skin over a palm, then all maps over a hand.
 
         Args:
-            skin: per pixel of evidence; the border is repeated beyond the window.
+            skin: its mean over every cell; the border is repeated beyond the window.
             motion: `over_hands` of the differences from the last frame and from the median.
         """
-        halved = halve(skin[:, None])
-        palm = self.palm_rows @ halved @ self.palm_columns.T
-        return torch.cat([palm, self.hand_rows @ halved @ self.hand_columns.T, motion], 1)
+        palm = self.palm_rows @ skin @ self.palm_columns.T
+        return torch.cat([palm, self.over_hands(skin), motion], 1)
 
-    def over_hands(self, maps: Float[Tensor, "N C h w"]) -> Float[Tensor, "N C r c"]:
-        """Return means of maps over a hand about the centre of every cell; see `means`."""
-        return self.hand_rows @ halve(maps) @ self.hand_columns.T
+    def over_hands(self, maps: Float[Tensor, "N C r c"]) -> Float[Tensor, "N C r c"]:
+        """Return means of maps of the cells over a hand about the centre of every cell; see `means`."""
+        return self.hand_rows @ maps @ self.hand_columns.T
 
     def forward(
         self,

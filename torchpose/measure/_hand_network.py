@@ -8,15 +8,22 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
-from torchpose._core.module_state import outside_inference
+from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
-from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
+from torchpose.measure._body_window import (
+    CELLS,
+    EVIDENCE,
+    cell_centres,
+    halve,
+    part_of_window,
+)
 from torchpose.measure._hand_layers import Layer, UpwardLayer, for_inference
 
 COARSE = (CELLS[0] // 2, CELLS[1] // 2)
@@ -145,12 +152,7 @@ class HandNetwork(FittedNetwork):
         Args:
             colours: of `relative_colours`. inside: the share of each coarse cell in the image.
         """
-        there = inside > 0.5
-        if not bool(there.all()):  # the border of an image goes on beyond it
-            kept = interpolate(there.to(colours), scale_factor=4.0)
-            # filling by a mask takes twenty times as long
-            colours = torch.addcmul((kept - 1) * _MOST, colours, kept)
-        return self.colours(colours)  # type: ignore[no-any-return]
+        return self.colours(_within(_Inside.of(inside), colours))  # type: ignore[no-any-return]
 
     def features(
         self,
@@ -184,13 +186,13 @@ class HandNetwork(FittedNetwork):
         faces: Float[Tensor, "N 3"],
     ) -> Float[Tensor, "N F r c"]:
         """Return the features that come from the colours of windows alone; see `find`."""
-        colours = relative_colours(lab, faces)
-        return for_inference(self).features_of_colours(colours, _coarse(inside[:, None]))
+        colours = _within(self._inside(inside), relative_colours(lab, faces))
+        return for_inference(self).colours(colours)
 
     def find(
         self,
         lab: UInt8[Tensor, "N 3 h w"],
-        maps: Float[Tensor, "N 3 h w"],
+        maps: Float[Tensor, "N 3 y x"],
         inside: Float[Tensor, "N h w"],
         faces: Float[Tensor, "N 3"],
         elbows: bool = True,
@@ -200,13 +202,13 @@ class HandNetwork(FittedNetwork):
 
         Args:
             lab: bytes, two pixels for a cell [N, 3, 176, 192]. maps: skin, difference from the last frame and
-                from the median [N, 3, 176, 192]. inside: share of each pixel in the image.
+                from the median, of the cells [N, 3, 88, 96]. inside: share of each pixel in the image.
             faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
             seen: of `see_colours`, if known.
         """
         if seen is None:
             seen = self.see_colours(lab, inside, faces)
-        every = torch.cat([_coarse(maps), _coarse(inside[:, None])], 1)
+        every = torch.cat([halve(maps), self._inside(inside).share], 1)
         logits = for_inference(self).logits(seen, every, faces, elbows)
         places, gone = logits[..., :-1], logits[..., -1]
         total = torch.logsumexp(places, -1, keepdim=True)
@@ -214,6 +216,40 @@ class HandNetwork(FittedNetwork):
         fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False)
         gone = gone - total[..., 0]
         return HandPlaces(fine[:, :2], gone[:, :2], fine[:, 2:], gone[:, 2:])
+
+    def _inside(self, inside: Float[Tensor, "N h w"]) -> _Inside:
+        """Return what the network needs of where the image is; kept, since windows mostly stay in place."""
+        return derived(self, "inside", (inside,), lambda: _Inside.of(halve(halve(inside))[:, None]))
+
+
+class _Inside(NamedTuple):
+    """Holds where the image is, for windows of N persons.
+
+    Attributes:
+        share: of each coarse cell in the image. kept: one where colours count, two pixels for a cell, and
+            beyond: what stands for them elsewhere; None if all count.
+    """
+
+    share: Float[Tensor, "N 1 r c"]
+    kept: Float[Tensor, "N 3 h w"] | None
+    beyond: Float[Tensor, "N 3 h w"] | None
+
+    @classmethod
+    def of(cls, share: Float[Tensor, "N 1 r c"]) -> _Inside:
+        there = share > 0.5
+        if bool(there.all()):
+            return cls(share, None, None)
+        kept = interpolate(there.to(share), scale_factor=4.0).expand(-1, _COLOURS, -1, -1)
+        kept = kept.contiguous(memory_format=torch.channels_last)
+        return cls(share, kept, (kept - 1) * _MOST)
+
+
+def _within(image: _Inside, colours: Float[Tensor, "N 3 h w"]) -> Float[Tensor, "N 3 h w"]:
+    """Return colours with the border of the image going on beyond it."""
+    if image.kept is None or image.beyond is None:
+        return colours
+    # filling by a mask takes twenty times as long
+    return torch.addcmul(image.beyond, colours, image.kept)
 
 
 def _with_gone(
@@ -231,35 +267,43 @@ def relative_colours(
     Args:
         lab: bytes, two pixels for a cell. faces: (x, y, size) in B from the anchors.
     """
-    size = faces[:, 2:]
-    centres = cell_centres(EVIDENCE).to(faces)
-    across = ((centres[0, :, 0] - faces[:, :1]) / size / _FACE[0]).square()
-    down = ((centres[:, 0, 1] - faces[:, 1:2]) / size / _FACE[1]).square()
-    face = (across[:, None] + down[:, :, None] < 1).float()
-    colours = lab.float()
-    total = (colours.flatten(2) @ face.flatten(1)[..., None])[..., 0]
-    mean = total / face.sum((1, 2))[:, None].clamp_min(1.0)
-    spread = colours.new_tensor(_SPREAD)[:, None, None]
-    return colours.sub_(mean[..., None, None]).div_(spread).clamp_(-_MOST, _MOST)
+    import cv2
+
+    mean = _mean_of_faces(lab, faces)[:, None]
+    byte = torch.arange(256, dtype=torch.float32)[:, None]
+    tables = ((byte - mean) / mean.new_tensor(_SPREAD)).clamp_(-_MOST, _MOST).numpy()
+    pixels = lab.permute(0, 2, 3, 1).numpy()
+    colours = np.empty(pixels.shape, np.float32)
+    for own, table, relative in zip(pixels, tables, colours, strict=True):
+        cv2.LUT(own, table[None], dst=relative)
+    return torch.from_numpy(colours).permute(0, 3, 1, 2)
 
 
-def _coarse(maps: Float[Tensor, "N C h w"]) -> Float[Tensor, "N C r c"]:
-    """Return the means of maps over the coarse cells."""
-    return avg_pool2d(maps.unflatten(2, (COARSE[0], -1)).mean(3), (1, 2 * EVIDENCE))
+def _mean_of_faces(
+    lab: UInt8[Tensor, "N 3 h w"], faces: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Return the mean colour of each face; zero without one in its window."""
+    half = faces[:, 2:] * faces.new_tensor(_FACE)
+    rows, columns = part_of_window(faces[:, :2] - half, faces[:, :2] + half, EVIDENCE)
+    centres = cell_centres(EVIDENCE)[rows, columns].to(faces)
+    away = (centres - faces[:, None, None, :2]) / half[:, None, None]
+    face = (away.square().sum(-1) < 1).float()[:, None]
+    total = (lab[:, :, rows, columns].float() * face).sum((2, 3))
+    return total / face.sum((2, 3)).clamp_min(1.0)
 
 
 def _where(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 r c"]:
     """Return the place of every coarse cell relative to the face, and how near to it that is."""
-    away = (_coarse_centres() - faces[:, :2, None, None]) / faces[:, 2:, None, None]
-    near = (-away.square().sum(1, keepdim=True)).exp()
-    return torch.cat([_FAR * away, near], 1)
+    away = (_coarse_centres() - faces[:, None, None, :2]) / faces[:, None, None, 2:]
+    near = (-away.square().sum(-1, keepdim=True)).exp()
+    return torch.cat([_FAR * away, near], -1).movedim(-1, 1)
 
 
 @cache
 @outside_inference()
-def _coarse_centres() -> Float[Tensor, "1 2 r c"]:
+def _coarse_centres() -> Float[Tensor, "r c 2"]:
     """Return the places (x, y) of the coarse cells, in B from the anchor."""
-    return avg_pool2d(cell_centres().movedim(-1, 0)[None], 2)
+    return avg_pool2d(cell_centres().movedim(-1, 0), 2).movedim(0, -1).contiguous()
 
 
 @cache

@@ -21,6 +21,7 @@ from torchpose.measure._body_window import (
     faces_in_evidence,
     faces_in_window,
     follow_faces,
+    halve,
     inside_image,
     place_windows,
 )
@@ -61,7 +62,7 @@ class HandView(NamedTuple):
         lab: bytes. head: `head_part` of the window, bytes, four pixels for a cell.
         gain: that dark windows were multiplied by before. bins: of the skin's histograms.
         inside: share of each pixel in the image. foreground: share; None if not known.
-        maps: difference from the last frame and from the median, 0 outside of the image [N, 2, 176, 192].
+        maps: difference from the last frame and from the median, 0 outside of the image [N, 2, 88, 96].
         flow: of `Motion`.
         colours: features of the network, from colours alone; None without a network.
         motion: means of both kinds over hands [N, 2, 88, 96]. moves: amount of motion, 0 to 1 [N].
@@ -85,7 +86,7 @@ class HandView(NamedTuple):
     bins: Int[Tensor, "N h w"]
     inside: Float[Tensor, "N h w"]
     foreground: Float[Tensor, "N h w"] | None
-    maps: Float[Tensor, "N 2 h w"]
+    maps: Float[Tensor, "N 2 r c"]
     flow: Float[Tensor, "N r c 2"]
     colours: Float[Tensor, "N F a b"] | None
     motion: Float[Tensor, "N 2 r c"]
@@ -142,19 +143,21 @@ class HandWindows:
         if bool(moved.any()):
             motion = self.motion.move(motion, before, anchors, moved)
         lab, smooth, head, gain = cut_colours(frame, anchors, head_part(COLOURS))
-        motion, moving, unusual, flow = self.motion.step(motion, smooth, lab[:, 0])
+        planes = lab.contiguous()
+        motion, moving, unusual, flow = self.motion.step(motion, smooth, planes[:, 0])
         inside = inside_image(anchors, frame.shape[1], frame.shape[0], EVIDENCE)
         near = faces_in_window(faces, anchors)
         colours = None if self.network is None else self.network.see_colours(lab, inside, near)
         mask = None if foreground is None else cut_mask(foreground, anchors)
         maps = torch.stack([moving, unusual], 1)
         if float(inside.min()) < 1:
-            maps = maps * inside[:, None]
+            maps.mul_(inside[:, None])
+        maps = halve(maps)
         over_hands = self.likelihood.over_hands(maps)
         log_prior, elbow = self._prior(near)
         view = HandView(
             (frame.shape[0], frame.shape[1]), identity, anchors, before, moved, faces, near,
-            lab, head, gain, self.skin.byte_bins(lab), inside, mask, maps, flow, colours, over_hands,
+            lab, head, gain, self.skin.byte_bins(planes), inside, mask, maps, flow, colours, over_hands,
             self._moves(over_hands[:, 0], log_prior),
             parts_of_persons(faces_in_evidence(faces, anchors), lab.shape[2:]),
             log_prior, self._rebirth(log_prior, near), elbow, self.likelihood.shape_places(elbow),

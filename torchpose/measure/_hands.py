@@ -18,6 +18,7 @@ from torchpose.measure._body_window import (
     CELLS,
     EVIDENCE,
     cells_to_pixels,
+    halve,
     move_maps,
     pixels_to_cells,
 )
@@ -292,10 +293,11 @@ class HandTracker(nn.Module):
             skin = skin * view.foreground
         if float(inside.min()) < 1:
             skin = skin * inside + self.likelihood.unknown * (1 - inside)
-        means = self.likelihood.means(skin, view.motion)
+        of_cells = halve(skin)[:, None]
+        means = self.likelihood.means(of_cells, view.motion)
         found = None
         if self.network is not None:
-            maps = torch.cat([skin[:, None], view.maps], 1)
+            maps = torch.cat([of_cells, view.maps], 1)
             found = self.network.find(view.lab, maps, inside, view.near, self.elbows, view.colours)
         return state._replace(skin=learnt, memory=memory), means, found
 
