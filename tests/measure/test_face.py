@@ -101,6 +101,18 @@ def test_known_faces_are_searched_where_they_are():
     assert later[0].smallest == pytest.approx(67.5, abs=2)
 
 
+@pytest.mark.parametrize("found", [[[330.0, 200.0, 90.0]], [[300.0, 200.0, 116.0]], []])
+def test_a_face_that_is_not_where_it_was_expected_is_searched_for_in_more_of_the_image(found):
+    before, frames = [[300.0, 200.0, 90.0]], 16
+    _, _, detector = follow([before] * frames + [found], every=1, whole_every=100)
+    close, around = detector.asked[frames : frames + 2]
+    assert (close.left, close.right) == pytest.approx((228, 372), abs=3)
+    assert (around.left, around.right) == pytest.approx((201, 399), abs=3)
+    assert (around.smallest, around.largest) == pytest.approx((67.5, 126), abs=3)
+    asked = [region.left for region in detector.asked[1:frames]]
+    assert asked == [around.left] * 9 + [close.left] * (frames - 10)
+
+
 def test_frames_without_a_search_need_no_image():
     tracker, states, detector = follow([[[300.0, 200.0, 90.0]]] * 12, every=2, whole_every=10)
     before, image = [tracker.init(), *states[:-1]], np.full((480, 640), 3, np.uint8)
@@ -135,7 +147,7 @@ def test_a_face_that_walks_out_of_the_image_is_searched_for_in_what_is_left_of_i
     tracker, image = FaceTracker(noted, detail=80.0), np.zeros((480, 640), np.uint8)
     for out in np.arange(0.9, 1.3, 1 / 480) * size:
         for place in ((-out, 200.0), (639 + out, 200.0), (300.0, -out), (300.0, 479 + out)):
-            assert len(tracker._look_near(image, [*place, size])) == 0
+            assert len(tracker._look_near(image, [*place, size], lasting=True)) == 0
     assert min(map(min, parts)) >= 1
     assert max(map(min, parts)) <= 0.25 * 80  # never the rest of the image
 
