@@ -136,6 +136,22 @@ def test_colours_are_relative_to_the_face():
     torch.testing.assert_close(inside, torch.zeros_like(inside), atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_colours_are_differences_from_the_mean_of_the_face(interleaved):
+    """Of faces in the middle, at the border of the window, and outside."""
+    faces = torch.tensor([[0.1, -0.05, 1.02], [-4.7, -3.0, 0.9], [9.0, 0.0, 1.0]])
+    lab = windows(3)[0]
+    if interleaved:
+        lab = lab.contiguous(memory_format=torch.channels_last)
+    found = relative_colours(lab, faces)
+    for pixels, face, relative in zip(lab.double(), faces, found, strict=True):
+        away = ((cell_centres(2) - face[:2]) / face[2] / torch.tensor([0.35, 0.4])).square().sum(-1)
+        own = pixels[:, away < 1]
+        mean = own.mean(1) if own.numel() else torch.zeros(3).double()
+        difference = (pixels - mean[:, None, None]) / torch.tensor([40.0, 12, 12])[:, None, None]
+        torch.testing.assert_close(relative.double(), difference.clamp(-4, 4), atol=1e-5, rtol=0)
+
+
 @torch.no_grad()
 def test_a_file_gives_the_same_network(tmp_path):
     info = HandNetworkInfo("own", ("a", "b"), ("anna",), "MIT", "fit")
