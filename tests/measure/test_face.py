@@ -200,6 +200,20 @@ def test_bad_input_is_refused():
         tracker.update(tracker.init(), torch.zeros(1, 4))
 
 
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])
+def test_detections_come_in_one_order_however_threads_end(order):
+    boxes = np.array([[60, 20, 50, 50], [10, 30, 40, 40], [200, 10, 40, 40]])
+
+    class Cascade:
+        def detectMultiScale(self, *_, **__):
+            return boxes[order]
+
+    detector = HaarFaceDetector()
+    detector._cascade = Cascade()
+    found = detector(np.full((120, 320), 128, np.uint8))
+    assert found.tolist() == [[220, 30, 40], [30, 50, 40], [85, 45, 50]]
+
+
 def test_the_detector_finds_nothing_in_an_empty_region():
     image = np.full((200, 200), 128, np.uint8)
     assert len(HaarFaceDetector()(image)) == 0

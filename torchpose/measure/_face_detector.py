@@ -127,8 +127,10 @@ class HaarFaceDetector:
             np.ascontiguousarray(_brightened(image)), self.scale_factor, neighbours,
             minSize=(smallest,) * 2, maxSize=(max(smallest, largest),) * 2,
         )  # fmt: skip
-        found = torch.from_numpy(np.asarray(boxes, dtype=np.float64).reshape(-1, 4))
-        return torch.cat([found[:, :2] + found[:, 2:] / 2, found[:, 2:3]], 1)
+        found = np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
+        found = found[np.lexsort(found.T[:3])]  # threads of OpenCV end in any order
+        corners, size = torch.from_numpy(found).split([2, 2], 1)
+        return torch.cat([corners + size / 2, size[:, :1]], 1)
 
 
 def _brightened(image: Image) -> Image:
