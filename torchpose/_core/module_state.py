@@ -62,10 +62,11 @@ class _Mark(NamedTuple):
         return cls(tensor, tensor._version, tensor.data_ptr(), tensor.dtype)
 
     def holds(self, tensor: Tensor) -> bool:
-        return self.tensor is tensor and self[1:] == (
-            tensor._version,
-            tensor.data_ptr(),
-            tensor.dtype,
+        return (
+            tensor is self.tensor
+            and tensor._version == self.version
+            and tensor.data_ptr() == self.address
+            and tensor.dtype == self.dtype
         )
 
 
@@ -74,6 +75,12 @@ class _Entry(NamedTuple):
 
     marks: tuple[_Mark, ...]
     value: Any
+
+    def holds(self, given: Sequence[Tensor]) -> bool:
+        """Return whether these are the tensors that the value was derived from, as they were then."""
+        return len(self.marks) == len(given) and all(
+            mark.holds(source) for mark, source in zip(self.marks, given, strict=True)
+        )
 
 
 class _Kept(dict[Hashable, _Entry]):
@@ -147,9 +154,16 @@ def derived(
     name = (name, values_visible())  # what was made without checks is not for those with
     if torch.compiler.is_dynamo_compiling():
         return make()
-    if torch.compiler.is_compiling() or any(map(_is_opaque, given)):
+    compiling = torch.compiler.is_compiling()
+    learning = torch.is_grad_enabled() and any(source.requires_grad for source in given)
+    kept = _KEPT.get(module)
+    if not compiling and not learning and kept is not None:  # most often it holds
+        entry = kept.get(name)
+        if entry is not None and entry.holds(given):
+            return entry.value
+    if compiling or any(map(_is_opaque, given)):
         return _kept_in_this_run((id(module), name), given, make) if _GRAPHS.depth else make()
-    if torch.is_grad_enabled() and any(source.requires_grad for source in given):
+    if learning:
         if not _GRAPHS.depth:
             return make()
         return _kept_in(_GRAPHS.kept, (id(module), name), given, make)
@@ -181,10 +195,7 @@ def index_tensor(rows: tuple[int, ...], device: torch.device) -> Tensor:
 
 def _kept_in(kept: _Kept, key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]) -> T:
     entry = kept.get(key)
-    same = entry is not None and len(entry.marks) == len(given)
-    if entry is None or not (
-        same and all(m.holds(s) for m, s in zip(entry.marks, given, strict=True))
-    ):
+    if entry is None or not entry.holds(given):
         marks = tuple(_Mark.of(source) for source in given)
         entry = _Entry(marks, make())
         kept[key] = entry
