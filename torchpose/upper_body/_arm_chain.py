@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpose._core.module_state import outside_inference
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._direction_density import DirectionDensity
-from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray
+from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, take_rows
 from torchpose.upper_body._torso_occlusion import log_in_view
 
 _ANGLES = 17  # of a bone whose end is measured
@@ -37,7 +37,7 @@ class ArmInput(NamedTuple):
 
     Attributes:
         shoulder: metres, [B, 2, M, 3]. middle: that of both shoulders, [B, 2, M, 3].
-        rays: the rays of elbow and hand, [B, 2, M, 2, 3].
+        rays: the rays of elbow and hand, of length one, [B, 2, M, 2, 3].
         known: whether elbow and hand are measured, [B, 2, 2].
         patterns: the pairs of these that there are, for elbow and hand of any arm.
         variance: the variance across the rays of elbow and hand, metres squared, [B, 2, M, 2].
@@ -205,14 +205,13 @@ class ArmChain:
         weight = weight.flatten(-2)
         uppers = upper.directions.expand_as(start)
         prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
-        shape = *start.shape[:-1], sizes[1], 3
-        bones = uppers[..., None, :], lower.directions
         if weight.shape[-1] <= count:
+            shape = *start.shape[:-1], sizes[1], 3
+            bones = uppers[..., None, :], lower.directions
             directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
             return Arms(directions, weight, prior)
-        best = (weight + prior).topk(count, -1).indices
-        chosen = [_rows_of(bone.expand(shape).flatten(-3, -2), best) for bone in bones]
-        return Arms(torch.cat(chosen, -1), weight.gather(-1, best), prior.gather(-1, best))
+        best = (weight + prior).topk(count, -1, sorted=False).indices
+        return Arms(lower.chosen(uppers, best), weight.gather(-1, best), prior.gather(-1, best))
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -226,7 +225,7 @@ class ArmChain:
         """
         logs = arms.log_weight + arms.log_prior
         logs, rows = logs.topk(min(_LIKELIEST, logs.shape[-1]), -1)
-        chosen = _rows_of(arms.directions, rows)
+        chosen = take_rows(arms.directions, rows)
         weight = torch.softmax(logs, -1)[..., None, :]
         left, right = (weight @ self.density.shares(chosen))[..., 0, :].unbind(1)
         tied = ((left @ self.density.together) * right).sum(-1)
@@ -340,11 +339,11 @@ class ArmChain:
         scale = step**2
         most = 6 / (16 * math.pi**2 * scale**2)
         unit = most**-0.25
-        # of two pairs of unit vectors the product is 2 where they agree
+        # of two pairs of unit vectors the product is 2 where they agree, and less elsewhere: far >= unit
         same = before.new_full((1, 1, 1), unit * (1 + 1 / scale))
         far = torch.baddbmm(same, before, after.mT, alpha=-unit / (2 * scale))
         # in place: memory for as many numbers again takes longer than the arithmetic
-        return far.clamp_min_(unit).square_().pow_(-2)
+        return far.square_().pow_(-2)
 
 
 def _given_later(state: ArmState, message: Float[Tensor, "B 2 N"]) -> ArmState:
@@ -361,16 +360,6 @@ def _belief(
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
     return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen)
-
-
-def _rows_of(
-    directions: Float[Tensor, "*batch N D"], rows: Int[Tensor, "*batch K"]
-) -> Float[Tensor, "*batch K D"]:
-    """Return some directions of each batch element; whole rows are taken faster than by `gather`."""
-    n, size = directions.shape[-2:]
-    flat = directions.reshape(-1, size)
-    start = torch.arange(0, len(flat), n, device=rows.device).view(*rows.shape[:-1], 1)
-    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, size)
 
 
 def _axes_of_spheres(axes: Float[Tensor, "B M 3 3"]) -> Float[Tensor, "B 2 M 3 3"]:

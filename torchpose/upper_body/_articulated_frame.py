@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import normalize, pad
 
 from torchpose._core.module_state import index_tensor
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -29,7 +29,7 @@ def _pair(joint: str) -> slice:
 
 SHOULDERS, ELBOWS, HANDS = (_pair(joint) for joint in ("shoulder", "elbow", "hand"))
 _BOTH = [UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right")]
-# Of the rays of a frame: all joints, then those of the torso, then elbow and hand of each arm.
+# Of the rays of a frame: all joints, then those of the torso, then elbow and hand of each arm, of length one.
 _ROWS = (*range(len(UPPER_BODY)), *_BOTH, _NECK, UPPER_BODY.index("head"), *LIMBS)
 _TORSO, _LIMBS, _LIFTS = slice(8, 12), slice(12, 16), slice(16, 18)
 _ENDS = ((False, False), (False, True), (True, False), (True, True))  # measured: elbow, hand
@@ -52,9 +52,9 @@ class RayFrame(NamedTuple):
     """Measurements of one frame as rays, or of T frames [B, T, ...] until they are split.
 
     Attributes:
-        rays: K^-1 [u, v, 1] of the joints in `_ROWS`; then, for both arms, the way from the end that is
-            measured to the shoulder over its reach, [.., 0]; then nose, eyes and ears, [.., 0].
-            [B, 18 or 23, 3].
+        rays: K^-1 [u, v, 1] of the joints in `_ROWS`, of length one for the last four; then, for both arms,
+            the way from the end that is measured to the shoulder over its reach, [.., 0]; then nose, eyes
+            and ears, [.., 0]. [B, 18 or 23, 3].
         known: whether each of the eight joints is measured, [B, 8].
         std: the standard deviation of a pixel over the focal length, [B, 8].
         exact: whether every keypoint has full confidence, [B].
@@ -149,7 +149,8 @@ def as_rays(measured: MeasuredJoints, optics: Optics) -> RayFrame:
     sure = measured.confidence
     exact = known.any(-1) if sure is None else (sure >= 1).all(-1)
     lifts, lifted = _lifts(rays, known)
-    parts = [rays.index_select(-2, rows), lifts]
+    of_joints, of_limbs = rays.index_select(-2, rows).tensor_split([_LIMBS.start], -2)
+    parts = [of_joints, normalize(of_limbs, dim=-1), lifts]
     face, matrix = measured.face, optics.matrix
     if face is not None:
         places = (face.places - matrix[:2, 2]) / matrix.diagonal()[:2]

@@ -53,6 +53,7 @@ class DirectionDensity:
         self._slopes /= _LOG_2
         by_bone = _by_bone(-0.5 * precision, pulled, constant)
         self._forms = {count: _form(*by_bone, count) for count in (2, 3)}
+        self._ones = torch.ones_like(weights)  # a product adds up components faster than a sum
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
@@ -110,7 +111,7 @@ class DirectionDensity:
         """Return the density of the mixture at N upper arms with G forearms, without its broad part."""
         of_pairs = torch.bmm((one[:, :, None] * other[:, None]).flatten(1, 2).mT, slopes)
         densities = self._powers(products @ of_pairs.flatten(1))
-        return densities.view(len(products), -1, slopes.shape[-1]).sum(-1)
+        return densities.view(len(products), -1, slopes.shape[-1]) @ self._ones
 
     def _densities(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the densities of the components, the broad one last.

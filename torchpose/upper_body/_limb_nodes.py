@@ -3,41 +3,62 @@
 from __future__ import annotations
 
 import math
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchpose._core.module_state import outside_inference
 
 _STEEPEST = 80.0  # degrees out of the image plane; beyond, a limb is a point in the image
 
 
-class LimbNodes(NamedTuple):
+@dataclass(frozen=True)
+class LimbNodes:
     """Hypotheses about one limb.
 
     Attributes:
         start: the near end of the limb, [..., 3]. length: its length, [...].
-        directions: unit vectors from there to the far end, sum_a t_a e_a, [..., G, 3].
-        axes, turns: e and t, [..., A, 3] and [G, A].
+        axes, turns: e and t of the unit vectors from there to the far end, sum_a t_a e_a, [..., A, 3] and
+            [G, A].
         log_weight: the log of the likelihood of the pixel times the node's share of the sphere of
             directions, [..., G]. A sum over nodes, times a density over directions, is its integral.
     """
 
     start: Tensor
     length: Tensor
-    directions: Tensor
     axes: Tensor
     turns: Tensor
     log_weight: Tensor
 
-    @property
+    @cached_property
+    def directions(self) -> Float[Tensor, "*batch G 3"]:
+        """Return the unit vectors from the near end to the far end."""
+        return _turned(self.axes, self.turns)
+
+    @cached_property
     def ends(self) -> Float[Tensor, "*batch G 3"]:
         """Return the far ends of the limb."""
         return self.start[..., None, :] + self.length[..., None, None] * self.directions
+
+    def chosen(
+        self, near: Float[Tensor, "*batch G0 3"], rows: Int[Tensor, "*batch N"]
+    ) -> Float[Tensor, "*batch N 6"]:
+        """Return the directions of some pairs of the limb before, which has G0, and of this one.
+
+        Args:
+            near: the directions of the limb before, from whose far ends this one starts.
+            rows: the pairs, as rows of G0 G.
+        """
+        count = len(self.turns)
+        axes = self.axes.expand(*near.shape[:-1], -1, 3).flatten(-2)
+        bones = take_rows(torch.cat([near, axes], -1), rows // count)
+        first, *along = bones.unflatten(-1, (-1, 3)).unbind(-2)
+        turns = self.turns[rows % count][..., None].unbind(-2)
+        return torch.cat([first, _sum_of(turns, along)], -1)
 
 
 def nodes_on_ray(
@@ -60,19 +81,18 @@ def nodes_on_ray(
     pixels up to their noise.
 
     Args:
-        start: the near end of the limb, metres. ray: the ray of the far end's pixel, of any length.
+        start: the near end of the limb, metres. ray: the ray of the far end's pixel, of length one.
         length: L. std: sigma, metres. n_nodes: G.
     """
-    along = normalize(ray, dim=-1)
-    across = (start * along).sum(-1, keepdim=True) * along - start
+    across = (start * ray).sum(-1, keepdim=True) * ray - start
     rho = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
     turns = _even_angles(n_nodes, start.dtype, start.device)
     off = (rho - length[..., None] * turns[:, 1]) / std[..., None]
     step = math.log(math.radians(2 * _STEEPEST / (n_nodes - 1)))
     constant = step - 0.5 * math.log(2 * math.pi) - (std * length).log()
     log_weight = constant[..., None].sub(off.square(), alpha=0.5)
-    axes = torch.stack([along.expand_as(across), across / rho.clamp_min(1e-6)], -2)
-    return LimbNodes(start, length, _turned(axes, turns), axes, turns, log_weight)
+    axes = torch.stack([ray.expand_as(across), across / rho.clamp_min(1e-6)], -2)
+    return LimbNodes(start, length, axes, turns, log_weight)
 
 
 def nodes_anywhere(
@@ -90,17 +110,30 @@ def nodes_anywhere(
     weight = start.new_full((), math.log(4 * math.pi / n_nodes))
     weight = weight.expand(*start.shape[:-1], n_nodes)
     points = _kept_sphere(n_nodes, start.dtype, start.device)
-    return LimbNodes(start, length, _turned(axes, points), axes, points, weight)
+    return LimbNodes(start, length, axes, points, weight)
+
+
+def take_rows(
+    values: Float[Tensor, "*batch N D"], rows: Int[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch K D"]:
+    """Return some rows of each batch element; whole rows are taken faster than by `gather`."""
+    n, size = values.shape[-2:]
+    flat = values.reshape(-1, size)
+    start = torch.arange(0, len(flat), n, device=rows.device).view(*rows.shape[:-1], 1)
+    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, size)
 
 
 def _turned(
     axes: Float[Tensor, "*batch A 3"], turns: Float[Tensor, "G A"]
 ) -> Float[Tensor, "*batch G 3"]:
+    """Return sum_a t_a e_a of each t."""
+    return _sum_of(turns[..., None].unbind(1), axes[..., None, :].unbind(-3))
+
+
+def _sum_of(turns: Sequence[Tensor], axes: Sequence[Tensor]) -> Tensor:
     """Return sum_a t_a e_a."""
-    first, *others = axes[..., None, :].unbind(-3)
-    turn, *more = turns[..., None].unbind(1)
-    total = turn * first
-    for axis, turn in zip(others, more, strict=True):
+    total = turns[0] * axes[0]
+    for turn, axis in zip(turns[1:], axes[1:], strict=True):
         total = torch.addcmul(total, axis, turn)
     return total
 
