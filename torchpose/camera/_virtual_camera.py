@@ -265,14 +265,15 @@ def view_body(
         reach: how far from the neck a hand is measured, pixels; 0 (or None) where none is.
     """
     offset = neck - model.neck.to(neck)
-    room = _BESIDE * matrix[0, 0] / offset.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    aside = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+    room = _BESIDE * matrix[0, 0] / aside.clamp_min(1e-6)
     target = model.neck.to(neck) + offset * room.clamp_max(1.0)
     rays = homogeneous_pixels(torch.stack([target, neck]))
     # K is triangular, so that its inverse is not needed
     rays = torch.linalg.solve_triangular(matrix.mT, rays, upper=False, left=False)
     wanted, current = _axes(rays)
     rotation = wanted @ current.mT
-    seen = height.norm(dim=-1).clamp_min(1e-6)
+    seen = torch.linalg.vector_norm(height, dim=-1).clamp_min(1e-6)
     farther = (model.height.to(height).norm() / seen).log()
     excess = _excess(farther, *_FARTHER) - _excess(-farther, *_NEARER)
     zoom = excess.clamp_max(math.log(_LARGEST_ZOOM)).exp()

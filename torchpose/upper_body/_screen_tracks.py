@@ -40,12 +40,17 @@ def init_screen(model: ScreenModel, batch_size: int) -> ScreenState:
     """Return the state before the first frame of B streams: joints may be anywhere in the image."""
     like, n = model.low, batch_size
     middle, cov = (model.low + model.high) / 2, like.new_tensor([model.broad, 0.0, 0.0])
-    exchange = like.new_full((n, len(model.exchanges)), -math.inf)
-    exchange[:, 0] = 0.0
     return ScreenState(
         middle.repeat(n, 2, 8, 1), like.new_zeros(n, 2, 8, 2), cov.repeat(n, 2, 8, 1),
-        like.new_zeros(n, 2, 8), exchange, like.new_zeros(n), model.usual.repeat(n, 1),
+        like.new_zeros(n, 2, 8), not_exchanged(model, n), like.new_zeros(n), model.usual.repeat(n, 1),
     )  # fmt: skip
+
+
+def not_exchanged(model: ScreenModel, batch_size: int) -> Float[Tensor, "B X"]:
+    """Return the log-probability of each way of exchange where nothing is exchanged."""
+    exchange = model.low.new_full((batch_size, len(model.exchanges)), -math.inf)
+    exchange[:, 0] = 0.0
+    return exchange
 
 
 def predict_tracks(
@@ -72,20 +77,21 @@ def take_over(
     """
     (track, candidate), (of_track, of_candidate) = odds.unbind(1), state.evidence.unbind(1)
     candidate = candidate.masked_fill(of_candidate <= 0, -math.inf)
-    right, beside = track + body > 0, candidate > 0
+    total = track + body
+    right, beside = total > 0, candidate > 0
     change = torch.where(right, -TAKEOVER, torch.where(beside, model.dt, -model.dt))
     of_track = (of_track + model.dt * (right & known)).clamp_max(TAKEOVER)
     of_candidate = (of_candidate + change * known).clamp(0.0, 2 * TAKEOVER)
     needed = of_track - TAKEOVER / (CERTAIN - DOUBTFUL) * (body + DOUBTFUL).clamp_max(0.0)
     taken = known & ~right & beside & (of_candidate > needed)
     state = state._replace(evidence=torch.stack([of_track, of_candidate], 1))
-    odds = torch.stack([track, candidate], 1)
     if bool(taken.any()):
         order = torch.stack([taken, ~taken], 1).long()
         tracks = {name: in_order(getattr(state, name), order, 1) for name in TRACKS}
-        state, odds = state._replace(**tracks), in_order(odds, order, 1)
-    track, candidate = odds.unbind(1)
-    return state, torch.stack([track + body, candidate], 1)
+        state = state._replace(**tracks)
+        track, candidate = in_order(torch.stack([track, candidate], 1), order, 1).unbind(1)
+        total = track + body
+    return state, torch.stack([total, candidate], 1)
 
 
 def update_tracks(
@@ -98,7 +104,7 @@ def update_tracks(
     apart = z[:, None] - state.position
     change = weight * ((1 - weight) * apart.square().sum(-1) / 2 - total)
     squares = torch.stack([gain.square(), gain * turn, turn.square()], -1)
-    forward, faster = (weight[..., None] * gains).split(1, -1)
+    forward, faster = (weight[..., None] * gains).chunk(2, -1)
     return state._replace(
         position=torch.addcmul(state.position, forward, apart),
         velocity=torch.addcmul(state.velocity, faster, apart),

@@ -28,6 +28,7 @@ from torchpose.upper_body._screen_tracks import (
     ScreenState,
     in_order,
     init_screen,
+    not_exchanged,
     predict_tracks,
     start_candidates,
     take_over,
@@ -96,10 +97,11 @@ def advance_screen(
     """
     with torch.no_grad():
         state, probability, way = _run(model, state, measured)
-    joints = model.exchanges[way]
+    exchanged = way > 0
+    joints = model.exchanges[way] if bool(exchanged.any()) else None
+    given = measured.mask if joints is None else measured.mask.gather(2, joints)
     screened = _screened(measured, probability, joints)
-    given = measured.mask.gather(2, joints)
-    return state, Screened(screened, probability.where(given, torch.nan), way > 0)
+    return state, Screened(screened, probability.where(given, torch.nan), exchanged)
 
 
 def _run(
@@ -111,12 +113,13 @@ def _run(
     noise = _largest_variance(measured.cov.to(model.low)).expand(known.shape)
     ways = model.exchanges
     frames = (uv[:, :, ways], known[:, :, ways], noise[:, :, ways], _doubt(measured)[:, :, ways])
-    probabilities, chosen = [], []
+    probabilities, chosen = [], torch.zeros_like(known[..., 0], dtype=torch.long)
     for t in range(uv.shape[1]):
         state, probability, way = _step(model, state, *(x[:, t] for x in frames))
         probabilities.append(probability)
-        chosen.append(way)
-    return state, torch.stack(probabilities, 1), torch.stack(chosen, 1)
+        if way is not None:
+            chosen[:, t] = way
+    return state, torch.stack(probabilities, 1), chosen
 
 
 def _step(
@@ -126,20 +129,17 @@ def _step(
     known: Bool[Tensor, "B X 8"],
     noise: Float[Tensor, "B X 8"],
     doubt: Float[Tensor, "B X 8"],
-) -> tuple[ScreenState, Float[Tensor, "B 8"], Int[Tensor, " B"]]:
-    """Return the next state, the inlier probabilities of a frame, and the way of exchange."""
+) -> tuple[ScreenState, Float[Tensor, "B 8"], Int[Tensor, " B"] | None]:
+    """Return the next state, the inlier probabilities of a frame, and the way of exchange; None is 0."""
     scale = model.scale * (state.scales.exp() @ model.log_scales).exp()
     square = scale.square()[:, None, None]
     state = predict_tracks(model, state, square)
     noise, jump = noise + SLACK**2 * square, square * model.jump
     odds = _log_odds(model, state, uv, known, noise, doubt, jump[:, None])
-    if len(model.exchanges) > 1:
-        hands = state.position[:, 0, _LEFT] - state.position[:, 0, _RIGHT]
-        state, odds, way = _exchange(model, state, odds, hands.norm(dim=-1) > APART * scale)
-    else:
-        odds, way = _Odds(*(x[:, :, 0] for x in odds)), torch.zeros_like(known[:, 0, 0].long())
-    rows = torch.arange(len(way), device=way.device)
-    z, known, noise = (x[rows, way] for x in (uv, known, noise))
+    hands = state.position[:, 0, _LEFT] - state.position[:, 0, _RIGHT]
+    apart = torch.linalg.vector_norm(hands, dim=-1) > APART * scale
+    state, odds, way = _exchange(model, state, odds, apart)
+    z, known, noise = (_of_way(x, way) for x in (uv, known, noise))
     body, scales = _beside_others(model, odds.total[:, 0], z, known, noise, state.scales)
     change = (odds.brisk * jump)[..., None] * model.lurch
     state = state._replace(cov=state.cov + change, scales=scales)
@@ -171,38 +171,40 @@ def _log_odds(
     calm = state.cov[:, :, None, :, 0] + noise[:, None]
     variance = torch.stack([calm, calm + jump], -1)
     densities = model.start - variance.log() - half[..., None] / variance
-    usual, brisk = (densities - doubt[:, None, ..., None]).unbind(-1)
-    total, known = torch.logaddexp(usual, brisk), known[:, None]
-    return _Odds(total * known, (brisk - total).exp() * (known & (total > 0)))
+    usual, brisk = densities.unbind(-1)
+    either, known = torch.logaddexp(usual, brisk), known[:, None]
+    total = either - doubt[:, None]
+    return _Odds(total * known, (brisk - either).exp() * (known & (total > 0)))
 
 
 def _exchange(
     model: ScreenModel, state: ScreenState, odds: _Odds, apart: Bool[Tensor, " B"]
-) -> tuple[ScreenState, _Odds, Int[Tensor, " B"]]:
+) -> tuple[ScreenState, _Odds, Int[Tensor, " B"] | None]:
     """Return the state after the most probable way to exchange left and right, its odds, and the way.
 
     It begins only where it puts both hands well on their tracks and these are apart: hands that meet may
-    part in two ways. One that lasts is no exchange: the tracks are, and take the other side's place.
+    part in two ways. One that lasts is no exchange: the tracks are, and take the other side's place. Where
+    none may begin, as in most frames, the way is None.
     """
     ways, track = model.exchanges, odds.total[:, 0]
-    fits = torch.nn.functional.softplus(track).sum(-1)
     ill = model.exchanged & ((track <= 0) | (odds.brisk[:, 0] >= 0.5))
-    barred = (
-        (ill.any(-1) | ~apart[:, None]) & (state.lasting <= 0)[:, None] & model.exchanged.any(1)
-    )
+    begun = state.lasting > 0
+    barred = (ill.any(-1) | ~apart[:, None]) & ~begun[:, None] & model.exchanged.any(1)
+    if bool(barred[:, 1:].all()):
+        state = state._replace(exchange=not_exchanged(model, len(track)))
+        return state, _Odds(*(_of_way(x, None, 2) for x in odds)), None
+    fits = torch.nn.functional.softplus(track).sum(-1)
     log_weights = (state.exchange[:, :, None] + model.switching).logsumexp(1)
     log_weights = (log_weights + fits).masked_fill(barred, -math.inf).log_softmax(-1)
     way = torch.where(log_weights[:, 0] < math.log(0.5), log_weights[:, 1:].argmax(-1) + 1, 0)
     lasting = torch.where(way > 0, state.lasting + model.dt, 0.0)
     turned = lasting > TAKEOVER
     state = state._replace(exchange=log_weights, lasting=lasting)
-    rows = torch.arange(len(way), device=way.device)
-    odds = _Odds(*(x[rows, :, way] for x in odds))
+    odds = _Odds(*(_of_way(x, way, 2) for x in odds))
     if not bool(turned.any()):
         return state, odds, way
     order = ways[torch.where(turned, way, 0)][:, None]
-    none = torch.full_like(log_weights, -math.inf)
-    none[:, 0] = 0.0
+    none = not_exchanged(model, len(track))
     state = state._replace(
         **{name: in_order(getattr(state, name), order, 2) for name in TRACKS},
         exchange=torch.where(turned[:, None], none, log_weights),
@@ -210,6 +212,13 @@ def _exchange(
     )
     odds = _Odds(*(in_order(x, order, 2) for x in odds))
     return state, odds, torch.where(turned, 0, way)
+
+
+def _of_way(values: Tensor, way: Int[Tensor, " B"] | None, dim: int = 1) -> Tensor:
+    """Return the values of each stream's way of exchange, along this dimension; None is 0."""
+    if way is None:
+        return values.select(dim, 0)
+    return values.movedim(dim, 1)[torch.arange(len(way), device=way.device), way]
 
 
 def _beside_others(
@@ -262,13 +271,17 @@ def _largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch
 
 
 def _screened(
-    measured: MeasuredJoints, probability: Float[Tensor, "B T 8"], joints: Int[Tensor, "B T 8"]
+    measured: MeasuredJoints,
+    probability: Float[Tensor, "B T 8"],
+    joints: Int[Tensor, "B T 8"] | None,
 ) -> MeasuredJoints:
-    """Return the measurements that are probable, of these joints; the same value if those are all."""
+    """Return the measurements that are probable, of these joints; the same value if those are all.
+
+    None are the joints as they are.
+    """
     uv, mask, cov = measured[:3]
     sure = measured.confidence
-    exchanged = bool((joints != torch.arange(8, device=mask.device)).any())
-    if exchanged:
+    if joints is not None:
         mask = mask.gather(2, joints)
         uv = uv.gather(2, joints[..., None].expand_as(uv))
         if cov.ndim > 3:
@@ -276,7 +289,7 @@ def _screened(
         if sure is not None:
             sure = sure.gather(2, joints)
     kept = mask & (probability >= 0.5)
-    if not exchanged and bool((kept == mask).all()):
+    if joints is None and bool((kept == mask).all()):
         return measured
     uv = torch.where(kept[..., None], uv, torch.zeros_like(uv))
     if sure is not None:
