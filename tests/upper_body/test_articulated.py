@@ -21,7 +21,9 @@ from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_frame import LIMBS, SHOULDERS
 from torchpose.upper_body._articulated_poses import _trust
+from torchpose.upper_body._articulated_root import RootStep
 from torchpose.upper_body._estimator import TrackerModel
+from torchpose.upper_body._lean import roll
 from torchpose.upper_body._root_grid import RootGrid
 from torchpose.upper_body._torso_likelihood import half_widths
 
@@ -207,6 +209,42 @@ def test_a_stream_gives_the_numbers_of_the_whole_recording():
         torch.testing.assert_close(pose.joints3d, whole.joints3d[:, t], rtol=0, atol=1e-9)
         torch.testing.assert_close(pose.log_evidence, whole.log_evidence[:, t], rtol=0, atol=1e-9)
     assert bool(whole.joints3d.isfinite().all())
+
+
+@pytest.mark.parametrize("fps", [12.0, 25.0, 60.0])
+def test_frames_that_are_weighed_together_are_as_one_by_one(fps):
+    """Torso and lengths are updated in other frames at each rate; axes of a leaning body change in all."""
+    joints = body(14)
+    neck = joints[:1, [ROW["neck"]]]
+    uv = pixels((joints - neck) @ roll(torch.tensor([0.5]).double()).mT + neck, 3.0)
+    uv[5:7, ROW["hand_right"]] = torch.nan
+    own = UpperBodyTracker(PRIOR, CAMERA, "articulated", fps=fps)
+    whole, state = own(uv[None]), own.init(1)
+    for t, frame in enumerate(uv):
+        state, pose = own.step(state, frame[None])
+        torch.testing.assert_close(pose.joints3d, whole.joints3d[:, t], rtol=0, atol=1e-11)
+        torch.testing.assert_close(pose.covariance3d, whole.covariance3d[:, t], rtol=0, atol=1e-11)
+
+
+def test_arms_of_frames_between_updates_are_weighed_together(monkeypatch):
+    """At 30 frames a second the torso changes in each third frame, and lengths after each sixth."""
+    sizes, weigh = [], RootStep.arms
+
+    def count(self, frame, *given):
+        sizes.append(len(frame.rays))
+        return weigh(self, frame, *given)
+
+    monkeypatch.setattr(RootStep, "arms", count)
+    seen = pixels(body(12))
+    tracker()(seen[None])
+    assert sizes == [1, 2, 3, 1, 2, 3]
+    sizes.clear()
+    seen[4, ROW["elbow_left"]] = torch.nan
+    tracker()(seen[None])
+    assert sizes == [1, 2, 1, 1, 1, 1, 2, 3]  # what is measured in a run is the same
+    sizes.clear()
+    tracker()(seen.expand(16, -1, -1, -1))
+    assert sizes == 12 * [16]  # many sequences gain nothing by more frames
 
 
 def test_sequences_of_a_batch_do_not_know_of_each_other():

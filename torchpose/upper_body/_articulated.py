@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -26,6 +26,8 @@ from torchpose.upper_body._articulated_frame import (
     Facts,
     Optics,
     RayFrame,
+    UprightFrame,
+    apart,
     as_rays,
     facts_of,
     split,
@@ -58,6 +60,7 @@ _SHARE_OF_TORSO = 0.6  # the same about the torso
 _UPDATE = 0.1  # seconds from one update of the torso to the next
 _BEGINNING = 0.5  # seconds after the first frame in which a body may start again
 _AT_ONCE = 32  # frames whose poses are read together
+_BODIES_AT_ONCE = 4  # frames times sequences whose arms are weighed together: more gain nothing
 
 
 class ArticulatedState(NamedTuple):
@@ -269,69 +272,136 @@ class ArticulatedFilter(Estimator):
             measured = with_middle(measured)
         rays = as_rays(measured, self.optics)
         facts = facts_of(rays, measured, self.optics.matrix)
-        frames = zip(split(rays), facts, strict=True)
-        for frame, known in tqdm([*frames], disable=not progress, desc="frames"):
-            step = self._step(state, frame, known)
-            state = step.state
-            yield step
+        frames, batch_size = split(rays), len(measured.uv)
+        with tqdm(total=len(frames), disable=not progress, desc="frames") as bar:
+            for run in self._runs(state.frame, facts, batch_size):
+                for step in self._run(state, frames[run], facts[run.start]):
+                    state = step.state
+                    yield step
+                bar.update(run.stop - run.start)
 
-    def _step(self, state: ArticulatedState, frame: RayFrame, facts: Facts) -> _Step:
-        """Return the result of a frame, computed in tilted axes, in which the torso is upright.
+    def _runs(self, frame: int, facts: Sequence[Facts], batch_size: int) -> list[slice]:
+        """Return frames in a row of which the same holds, and in which only the first one changes the torso.
+
+        A frame that the lengths of bones are learnt from, or that has no place of its own, stands alone.
 
         Args:
-            state: the state before the frame. frame: its measurements. facts: what holds for them.
+            frame: the number of the first one. facts: what holds for each. batch_size: B.
+        """
+        runs = [slice(0, 1)]
+        for t in range(1, len(facts)):
+            first, now = runs[-1].start, frame + t
+            learns = now % self.stride == 0 or (now - 1) % self.stride == 0
+            alike = facts[t].placed and facts[t].alike(facts[first])
+            full = (t - first) * batch_size >= _BODIES_AT_ONCE
+            if learns or now % self.every == 0 or not alike or full:
+                runs.append(slice(t, t + 1))
+            else:
+                runs[-1] = slice(first, t + 1)
+        return runs
+
+    def _run(
+        self, state: ArticulatedState, frames: Sequence[RayFrame], facts: Facts
+    ) -> Iterator[_Step]:
+        """Yield the results of some frames (`_runs`), computed in tilted axes, in which the torso is upright.
+
+        Args:
+            state: the state before the frames. frames: their measurements. facts: what holds for them.
         """
         due = state.roots is None or state.frame % self.every == 0
-        fresh, again = self._starting(state, frame) if due else (None, None)
+        fresh, again = self._starting(state, frames[0]) if due else (None, None)
         if again is not None:
             state = self._without_past(state, again)
-        lean, tilt, sizes, moments = state.lean, state.tilt, state.sizes, state.moments
-        if facts.leaning:
-            joints = frame.rays[:, : len(UPPER_BODY)]
-            lean = seen_lean(lean, joints, frame.known, moments.depth, self.model.rate)
-            tilt = roll(lean_angle(lean))
-        last = (state.middle[:, None] @ tilt)[:, 0]
-        tilted = upright(frame, facts, tilt)
-        # the torso: one hypothesis of the root, the mean of those near the likeliest
-        belief, roots, size, starts = state.root, state.roots, state.seen_size, state.starts
-        if roots is None or due:
-            power = torch.full_like(last[:, 0], 1.0 if roots is None else self.power)
-            power = power if fresh is None else power.masked_fill(fresh, 1.0)
-            size, farther = follow_size(size, tilted.torso, self.every / self.model.rate)
-            belief, roots, fits = self.root.weigh(
-                belief, tilted, last, sizes, power, fresh, _some(farther)
-            )
-            if starts is not None and fresh is not None and fits is not None:
-                left = (starts - 1).masked_fill(fits, 0)
-                starts = _some(torch.where(fresh, left, starts))
-            moments = self.grid.moments(belief)
-        root = roots.mean
+        state, before = self._leaning(state, frames[0], facts), state.moments
+        tilted = upright(frames[0], facts, state.tilt)
+        last = None if facts.placed else (state.middle[:, None] @ state.tilt)[:, 0]
+        if due:
+            state = self._with_torso(state, tilted, last, fresh)
+        roots = state.roots
+        if roots is None:
+            raise RuntimeError("the first frame is one that changes the torso")
+        states = [state]
+        for frame in frames[1:]:
+            later = states[-1]._replace(frame=states[-1].frame + 1)
+            states.append(self._leaning(later, frame, facts))
+        # the arms, given the torso
+        tilt = together([here.tilt for here in states])
+        if len(frames) > 1:
+            tilted = upright(together(frames), facts, tilt)
+        root, sizes = together(len(frames) * [(roots.mean, state.sizes)])
         middle = self.root.middle(tilted, root, last, sizes)
         shoulders = shoulder_places(tilted, root, middle, sizes.torso.width)
-        # the arms, given the torso
         arms = self.root.arms(tilted, root, shoulders, sizes)
-        hands = tilted.given.limbs[..., 1]
-        posterior = (
-            self.chain.start(arms, hands)
-            if state.arms is None
-            else self.chain.update(state.arms, arms, hands, again)
+        lengths, learnt_sizes = self._learnt(state, tilted, root, shoulders)
+        belief = state.arms
+        found = apart((arms, middle, shoulders, (middle @ tilt.mT)[:, 0]), len(frames))
+        for frame, here, own in zip(frames, states, found, strict=True):
+            own_arms, own_middle, own_shoulders, place = own
+            hands = frame.limbs[..., 1]
+            belief = (
+                self.chain.start(own_arms, hands)
+                if belief is None
+                else self.chain.update(belief, own_arms, hands, again)
+            )
+            seen = _Seen(
+                frame, facts, here.tilt, state.sizes, state.lengths, before, state.moments, roots,
+                roots.mean, own_middle, own_shoulders,
+            )  # fmt: skip
+            after = here._replace(
+                lengths=lengths, sizes=learnt_sizes, arms=belief, middle=place, frame=here.frame + 1
+            )
+            yield _Step(after, seen, belief)
+            again, before = None, state.moments
+
+    def _learnt(
+        self,
+        state: ArticulatedState,
+        frame: UprightFrame,
+        root: Root,
+        shoulders: Float[Tensor, "B 2 1 3"],
+    ) -> tuple[Lengths, Sizes]:
+        """Return the belief over the lengths of bones after a frame, and the lengths; the same in most."""
+        if state.frame % self.stride != 0:
+            return state.lengths, state.sizes
+        evidence = partial(self.root.evidence_of_lengths, frame, root, shoulders)
+        learnt = self.lengths.learn(state.lengths, frame.torso, root, evidence)
+        return learnt, self.lengths.sizes(learnt)
+
+    def _leaning(self, state: ArticulatedState, frame: RayFrame, facts: Facts) -> ArticulatedState:
+        """Return the state with the lean of the torso in a frame."""
+        if not facts.leaning:
+            return state
+        joints = frame.rays[:, : len(UPPER_BODY)]
+        lean = seen_lean(state.lean, joints, frame.known, state.moments.depth, self.model.rate)
+        return state._replace(lean=lean, tilt=roll(lean_angle(lean)))
+
+    def _with_torso(
+        self,
+        state: ArticulatedState,
+        frame: UprightFrame,
+        last: Float[Tensor, "B 3"] | None,
+        fresh: Bool[Tensor, " B"] | None,
+    ) -> ArticulatedState:
+        """Return the state after an update of the torso: hypotheses of the root near the likeliest.
+
+        Args:
+            state: the state before. frame: the measurements. last: as in `RootStep.weigh`.
+            fresh: which bodies start with this frame; None is nobody.
+        """
+        power = torch.full_like(state.middle[:, 0], 1.0 if state.roots is None else self.power)
+        power = power if fresh is None else power.masked_fill(fresh, 1.0)
+        size, farther = follow_size(state.seen_size, frame.torso, self.every / self.model.rate)
+        belief, roots, fits = self.root.weigh(
+            state.root, frame, last, state.sizes, power, fresh, _some(farther)
         )
-        # the lengths of the bones, given both
-        learnt = state.lengths
-        if state.frame % self.stride == 0:
-            evidence = partial(self.root.evidence_of_lengths, tilted, root, shoulders)
-            learnt = self.lengths.learn(learnt, tilted.torso, root, evidence)
-            sizes = self.lengths.sizes(learnt)
-        seen = _Seen(
-            frame, facts, tilt, state.sizes, state.lengths, state.moments, moments, roots, root,
-            middle, shoulders,
-        )  # fmt: skip
-        middle = (middle @ tilt.mT)[:, 0]
-        after = ArticulatedState(
-            belief, roots, size, moments, learnt, sizes, posterior, middle, lean, tilt, state.frame + 1,
-            starts,
-        )  # fmt: skip
-        return _Step(after, seen, posterior)
+        starts = state.starts
+        if starts is not None and fresh is not None and fits is not None:
+            left = (starts - 1).masked_fill(fits, 0)
+            starts = _some(torch.where(fresh, left, starts))
+        moments = self.grid.moments(belief)
+        return state._replace(
+            root=belief, roots=roots, seen_size=size, moments=moments, starts=starts
+        )
 
     def _starting(
         self, state: ArticulatedState, frame: RayFrame

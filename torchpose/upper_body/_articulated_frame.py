@@ -103,12 +103,17 @@ class Facts(NamedTuple):
     expected: Tensor | None
     borders: Tensor | None = None
 
+    def alike(self, other: Facts) -> bool:
+        """Return whether the same holds for other frames of the same sequences."""
+        return self[:5] == other[:5]
+
 
 class UprightFrame(NamedTuple):
     """One frame in axes in which the torso is upright, of a camera that is rolled by its lean.
 
     Attributes:
-        rays: of the eight joints, [B, 8, 3]. limbs: of elbow and hand of both arms, [B, 2, 2, 3].
+        rays: of the eight joints, [B, 8, 3]. limbs: of elbow and hand of both arms, of length one,
+            [B, 2, 2, 3].
         torso: the rays of the torso. face: nose, eyes and ears, or None.
         given: the measurements. facts: what holds for them.
         borders: the planes of the image's borders, then the optical axis, [B, P + 1, 3]; None without any.
@@ -222,6 +227,16 @@ def together(frames: Sequence[Any]) -> Any:
         return first
     parts = [together(values) for values in zip(*frames, strict=True)]
     return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
+
+
+def apart(values: Any, n_frames: int) -> list[Any]:
+    """Return values of B T frames as those of each of T frames [B, ...]; the inverse of `together`."""
+    if n_frames == 1:
+        return [values]
+    if isinstance(values, Tensor):
+        return [*values.unflatten(0, (-1, n_frames)).unbind(1)]
+    rows = zip(*(apart(value, n_frames) for value in values), strict=True)
+    return [type(values)(*row) if hasattr(values, "_fields") else row for row in rows]
 
 
 def _lifts(

@@ -79,7 +79,7 @@ class RootStep(NamedTuple):
         self,
         belief: Float[Tensor, "B S Z P"],
         frame: UprightFrame,
-        last: Tensor,
+        last: Float[Tensor, "B 3"] | None,
         sizes: Sizes,
         power: Float[Tensor, " B"],
         fresh: Bool[Tensor, " B"] | None,
@@ -89,7 +89,8 @@ class RootStep(NamedTuple):
 
         Args:
             belief: the belief at the last update. frame: the measurements, in tilted axes.
-            last: the middle of the shoulders in the frame before, in the same axes, [B, 3].
+            last: the middle of the shoulders in the frame before, in the same axes; None where some joint of
+                the torso is measured of everybody.
             sizes: the lengths of the bones. power: the exponent of the likelihood.
             fresh: whose body starts with this frame, so that the depths at which its arms cannot be are
                 ruled out before the likeliest hypotheses are picked; None is nobody.
@@ -120,7 +121,7 @@ class RootStep(NamedTuple):
         return belief, Roots(root, near, mean, middle, shoulders, arms.mean_directions), fits
 
     def _weighed(
-        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
+        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"] | None, sizes: Sizes
     ) -> _Weighed:
         """Return the arms given each hypothesis of the root, and their log-evidence."""
         middle = self.middle(frame, root, last, sizes)
@@ -132,12 +133,12 @@ class RootStep(NamedTuple):
         return _Weighed(middle, shoulders, arms, both, arms.log_evidence + area, arm.variance)
 
     def middle(
-        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
+        self, frame: UprightFrame, root: Root, last: Float[Tensor, "B 3"] | None, sizes: Sizes
     ) -> Float[Tensor, "B M 3"]:
         """Return the middle of the shoulders; on its last ray where no joint of the torso is measured."""
         torso = frame.torso
         found = middle_of_shoulders(torso, root, sizes.torso)
-        if frame.facts.placed:
+        if last is None:
             return found
         before = (last / last[:, 2:])[:, None] * root.depth[..., None]
         return torch.where(torso.known.any(1)[:, None, None], found, before)
@@ -201,7 +202,9 @@ def _arm_input(
     limbs = frame.limbs[:, :, None].expand(-1, -1, shoulders.shape[2], -1, -1)
     middle = shoulders.mean(1, keepdim=True).expand_as(shoulders)
     # the shoulder and the middle of both, then the rays of elbow and hand
-    places = torch.cat([torch.stack([shoulders, middle], -2), limbs], -2) @ axes.mT[:, None]
+    places = (
+        torch.cat([shoulders[..., None, :], middle[..., None, :], limbs], -2) @ axes.mT[:, None]
+    )
     joints, rays = mirrored(places).split([2, 2], -2)
     shoulder, middle = joints.unbind(-2)
     bones = lengths[:, None, None, :2].expand(*shoulders.shape[:3], 2)
