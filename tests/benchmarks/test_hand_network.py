@@ -132,7 +132,7 @@ def test_a_fit_is_a_network_that_is_ready_and_the_same_again():
     clips = [("anna", own)]
     one, two = (fit(clips, steps=2, progress=False) for _ in range(2))
     assert not one.training
-    lab, maps = clips[0][1].lab, torch.rand(2, 3, 176, 192)
+    lab, maps = clips[0][1].lab, torch.rand(2, 3, *CELLS)
     found = [net.find(lab, maps, torch.ones(2, 176, 192), clips[0][1].faces) for net in (one, two)]
     assert isinstance(found[0], HandPlaces)
     torch.testing.assert_close(found[0].log_prob, found[1].log_prob)

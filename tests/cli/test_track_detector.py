@@ -1,5 +1,7 @@
 """`torchpose track --detector`: poses of everybody, and what is refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -84,16 +86,16 @@ def test_everybody_whom_a_detector_finds_has_poses(track, folder):
 
 
 class Blank:
-    """A camera that shows nothing."""
+    """A camera that shows nothing, at the rate of its own clock."""
 
     def __init__(self, n_frames):
-        self.left = n_frames
+        self.left, self.now = n_frames, 0.0
 
     def isOpened(self):
         return True
 
     def read(self):
-        self.left -= 1
+        self.left, self.now = self.left - 1, self.now + 1 / 30
         return self.left >= 0, np.full((480, 640, 3), 90, np.uint8)
 
     def get(self, prop):
@@ -110,10 +112,12 @@ def test_persons_before_a_camera_have_the_names_that_they_had_while_it_ran(
     torchpose, files, folder, monkeypatch
 ):
     """The first one passes by, the second one stays for longer."""
-    monkeypatch.setattr("torchpose.video._camera.time.sleep", lambda seconds: None)
+    camera = Blank(N + 10)
+    clock = SimpleNamespace(monotonic=lambda: camera.now, sleep=lambda seconds: None)
+    monkeypatch.setattr("torchpose.video._camera.time", clock)
     monkeypatch.setattr(
         "torchpose.video.open_video",
-        lambda where, fps=None: CameraSource(int(where), fps, lambda index: Blank(N + 10)),
+        lambda where, fps=None: CameraSource(int(where), fps, lambda index: camera),
     )
     shown = []
 

@@ -142,15 +142,14 @@ def test_nodes_integrate_a_pixels_likelihood_over_the_sphere():
     length, std = torch.tensor(0.3, dtype=DOUBLE), torch.tensor(0.03, dtype=DOUBLE)
     directions = sphere_points(200_000)
     for end in ([0.3, -0.1, 2.15], [0.1, 0.08, 1.95], [0.27, -0.4, 1.9]):
-        ray = torch.tensor(end, dtype=DOUBLE)
-        along = ray / ray.norm()
+        along = torch.nn.functional.normalize(torch.tensor(end, dtype=DOUBLE), dim=0)
         off = start + length * directions
         off = off - (off @ along)[:, None] * along
         density = torch.exp(-0.5 * (off.norm(dim=-1) / std) ** 2) / (2 * math.pi * std**2)
         facing = directions @ along  # nodes stop 10 degrees before the ray
         density = density * (facing.abs() < math.sin(math.radians(80)))
         wanted = float(density.mean() * 4 * math.pi)
-        nodes = nodes_on_ray(start, ray, length, std, 81)
+        nodes = nodes_on_ray(start, along, length, std, 81)
         assert float(nodes.log_weight.exp().sum()) == pytest.approx(wanted, rel=0.05)
         apart = torch.linalg.vector_norm(nodes.ends - start, dim=-1)
         torch.testing.assert_close(apart, length.expand(81))

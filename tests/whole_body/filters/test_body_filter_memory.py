@@ -92,12 +92,12 @@ def test_a_trend_holds_what_was_before_and_details_are_reported_for_every_frame(
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_list_of_generators_holds_one_for_each_element_online_too(count):
     model, start = tracker(), torch.zeros(2, 2, dtype=WIDE)
-    with pytest.raises(InputError, match=f"each of the 2 sequences, got {count}"):
+    with pytest.raises(InputError, match=f"one for each sequence, got {count}"):
         model.init(start, generator=generators(count), initial_cov=1.0)
     state = model.init(start, generator=generators(2), initial_cov=1.0)
-    with pytest.raises(InputError, match=f"each of the 2 sequences, got {count}"):
+    with pytest.raises(InputError, match=f"one for each sequence, got {count}"):
         model.step(state, start, None, generator=generators(count))
-    with pytest.raises(InputError, match=f"each of the 2 sequences, got {count}"):
+    with pytest.raises(InputError, match=f"one for each sequence, got {count}"):
         model.advance(state, start[:, None], None, generator=generators(count))
 
 

@@ -103,5 +103,5 @@ def test_what_the_search_refuses():
         find_pose(BODY, image, RIG, n_layers=1)
     with pytest.raises(InputError, match="direction"):
         find_pose(BODY, image, RIG, up=torch.zeros(3))
-    with pytest.raises(InputError, match="each of the 2 sequences, got 1"):
+    with pytest.raises(InputError, match="must hold 2, one for each sequence, got 1"):
         find_pose(BODY, torch.stack([image, image]), RIG, None, [generator()])

@@ -626,7 +626,7 @@ def test_arguments_of_other_methods_are_refused():
         "generator": torch.Generator(), "initial_state": torch.zeros(36),
         "facing": torch.tensor([1.0, 0.0, 0.0]),
     }  # fmt: skip
-    for name, value in {**unused, "lengths": torch.tensor([1]), "n_frames": 2}.items():
+    for name, value in {**unused, "n_frames": 2}.items():
         with pytest.raises(
             InputError, match=f"{name} does nothing for method kalman; leave it out"
         ):
