@@ -144,6 +144,7 @@ def test_a_pause_is_no_time_in_which_frames_were_missed(camera):
         fake.now += 60.0 if len(frames) == 10 else 0.0
     assert [frame.index for frame in frames] == list(range(20))
     assert frames[-1].time > 60 and not any(frame.missed for frame in frames)
+    assert source.notes[0].startswith("pauses of more than 1 s between frames of camera 3")
 
 
 def test_delays_of_single_frames_are_no_missed_ones(camera):

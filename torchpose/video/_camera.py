@@ -119,7 +119,12 @@ class CameraSource(VideoSource):
     def _read(self) -> Iterator[VideoFrame]:
         import cv2
 
-        index, due, n_read = -1, 0.0, 0  # the next frame is due after this many seconds
+        index, due, n_read, n_pauses = (
+            -1,
+            0.0,
+            0,
+            0,
+        )  # the next frame is due after this many seconds
         try:
             for image, seconds in self._images():
                 late = (seconds - due) * self.fps  # in frames
@@ -127,7 +132,7 @@ class CameraSource(VideoSource):
                     continue
                 missed = round(late) if late > _EARLY else 0
                 if missed > _PAUSE_FROM * self.fps:
-                    missed, due = 0, seconds
+                    missed, due, n_pauses = 0, seconds, n_pauses + 1
                 due += (1 + missed) / self.fps
                 index, n_read = index + 1 + missed, n_read + 1
                 frame = CameraFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), seconds, index)
@@ -135,6 +140,11 @@ class CameraSource(VideoSource):
                 yield frame
         finally:  # also if it is closed
             self._note_rate(n_read, index + 1)
+            if n_pauses:
+                self.notes.append(
+                    f"pauses of more than {_PAUSE_FROM:g} s between frames of {self.name}, which take no "
+                    f"time in the results: {n_pauses}"
+                )
         self.notes.append(
             f"{self.name} gave no more frames after {n_read}: unplugged, or used by another program"
         )

@@ -5,7 +5,6 @@ another thread. `step` measures the persons, and may use the hands of the last p
 """
 
 from collections.abc import Generator, Iterable, Iterator, Mapping
-from itertools import repeat
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -217,8 +216,9 @@ def measure_blocks(
     found: list[Found] = []
     for frame in frames:
         state, one = measurer.step(state, frame)
-        images += [frame.image] * (1 + frame.missed) if keep else []
-        found += after_missed(frame, one)
+        block = block_of(frame, one, state)
+        images += block.images if keep else []
+        found += block.found
         if len(found) >= size:
             yield MeasuredBlock(images, found, state)
             images, found = [], []
@@ -226,6 +226,7 @@ def measure_blocks(
         yield MeasuredBlock(images, found, state)
 
 
-def after_missed(frame: SeenFrame, found: Found) -> list[Found]:
-    """Return the measurements of the frames missed before a frame, and of the frame itself."""
-    return [*repeat(MissedFrame(), frame.missed), found]
+def block_of(frame: SeenFrame, found: Found, state: Any) -> MeasuredBlock:
+    """Return a frame and those missed before it, given its measurements and the state after it."""
+    missed = [MissedFrame()] * frame.missed
+    return MeasuredBlock([frame.image] * (1 + frame.missed), [*missed, found], state)

@@ -45,7 +45,7 @@ from torchpose.video._measurers import (
     MeasuredBlock,
     Measurer,
     SeenFrame,
-    after_missed,
+    block_of,
     look_ahead,
     measure_blocks,
     measurer_of,
@@ -362,8 +362,7 @@ class VideoTracker(nn.Module):
         if self.candidates:
             for frame in seen:
                 own, found = measurer.step(state.measurer, frame, _candidates(state.poses))
-                count = 1 + frame.missed
-                block = MeasuredBlock([frame.image] * count, after_missed(frame, found), own)
+                block = block_of(frame, found, own)
                 state, tracked = self._follow(state, block)
                 yield state, block, tracked
             return

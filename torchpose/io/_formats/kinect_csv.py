@@ -107,13 +107,16 @@ def header_joints(line: str) -> dict[str, dict[str, int]]:
 def is_row(line: str) -> bool:
     """Return whether a line holds numbers, the first of which may be a time stamp."""
     try:
-        first, *others = split_row(line)
-        stamp_of(first)
-        for cell in others:
-            float(cell or "nan")
+        _numbers_of(line)
     except ValueError:
         return False
     return True
+
+
+def _numbers_of(line: str) -> list[float]:
+    """Return the numbers of a row, NaN where a cell is empty; `ValueError` if it holds something else."""
+    first, *others = split_row(line)
+    return [stamp_of(first), *(float(cell or math.nan) for cell in others)]
 
 
 def dropped_frames(stamps: np.ndarray, by: str = "time stamps") -> list[str]:
@@ -190,8 +193,7 @@ def _table(path: Path, rows: list[tuple[int, str]], layout: _Layout) -> np.ndarr
     table: list[list[float]] = []
     for number, line in rows:
         try:
-            first, *others = split_row(line)
-            row = [stamp_of(first), *(float(cell) if cell else math.nan for cell in others)]
+            row = _numbers_of(line)
         except ValueError as error:
             raise FileFormatError(
                 f"{path}, line {number}: expected numbers, or a header with NAME_x, NAME_y and NAME_z of "

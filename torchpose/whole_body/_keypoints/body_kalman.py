@@ -60,18 +60,13 @@ from torchpose.whole_body._keypoints.upright import Upright, upright_of
 FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
 
-SCALE_TIMES = (0.1, 2.0)
-"""Seconds of keypoints that the usual noise of a camera counts for, and over which the noise is averaged.
-
-In one camera the usual noise counts for the longer time: its scale depends on what the network lifts.
-"""
-
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
+_SCALE_TIME = 2.0  # seconds over which the factors of the cameras' noise are averaged
 _WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of the noise that are tried for cameras with few inliers
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
 
@@ -83,7 +78,7 @@ class BodyGaussian(NamedTuple):
         mean: points, [B]. cov: [B, N, N], in the tangent spaces of the means.
         log_odds: [B, C, 2], of exchanged sides of arms and legs. scale: [B, C], of the cameras' noise.
         doubt: [B, J], log-odds of a joint elsewhere than the prediction has it.
-        told: [B, C], number of frames that told the scale.
+        told: [B, C], number of frames whose mean the scale is, at most; the usual noise counts as some.
     """
 
     mean: BodyPoint
@@ -360,7 +355,7 @@ class BodyKalmanFilter(nn.Module):
                     for wide, own in zip(wider, (sums, count), strict=True)
                 )
         tells = (count / _SCALE_COUNT).clamp_max(1)
-        told = (state.told + tells).clamp_max(SCALE_TIMES[1] * self.fps)
+        told = (state.told + tells).clamp_max(_SCALE_TIME * self.fps)
         ratio = sums / count.clamp_min(1e-6)
         scale = state.scale * (1 + tells / told * (ratio - 1))
         return scale.clamp(*NOISE_SCALES), told

@@ -18,7 +18,6 @@ from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
     FEW_INLIERS,
-    SCALE_TIMES,
     BodyGaussian,
     BodyKalmanFilter,
     CorrectedBody,
@@ -48,6 +47,9 @@ _WIDTHS_OF_ONE = _WIDTHS[-5:]
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
 _SPEED, _TURN_SPEED = 1.5, 5.0  # per second
 _LOG_ODDS, _DOUBT = -6.0, -5.0
+# Seconds of keypoints that the usual noise of a camera counts for, of several cameras and of one, in which
+# the scale of the noise depends on what the network lifts.
+_USUAL, _USUAL_ALONE = 0.1, 2.0
 _TRUNK = (("left_shoulder", "right_shoulder", "neck", "head"), ("left_hip", "right_hip", "pelvis"))
 _SIDED = ("shoulder", "hip")
 _LEAST_WIDTH = 0.05  # metres between left and right that tell a direction
@@ -119,7 +121,7 @@ def _begun(
 def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps, fps: float) -> BodyGaussian:
     """Return Gaussians about points; nothing is known of cameras."""
     count, n_cameras = len(points.position), len(maps.shift)
-    told = SCALE_TIMES[0 if n_cameras > 1 else 1] * fps
+    told = (_USUAL_ALONE if n_cameras == 1 else _USUAL) * fps
     new = points.position.new_full
     return BodyGaussian(
         points,

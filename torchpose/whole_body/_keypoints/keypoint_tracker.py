@@ -127,9 +127,8 @@ class KeypointTracker(nn.Module):
         if not smoothing:
             return every.sequence
         poses, widened = every.sequence
-        if (
-            lengths is not None
-        ):  # a frame in which tracking begins anew says nothing of those before
+        # a frame in which tracking begins anew says nothing of those before
+        if lengths is not None:
             past = torch.arange(n_frames, device=lengths.device) == lengths[:, None]
             poses = poses._replace(started=poses.started | past)
         return self.smoothed(poses, widened)
