@@ -66,6 +66,24 @@ def test_poses_are_those_of_the_keypoint_tracker(prior, smoothing):
     same(person.track, whole(UpperBodyTracker(prior, CAMERA, **options), detector))
 
 
+@pytest.mark.parametrize("smoothing", [None, "full"])
+def test_keypoints_are_tracked_anew_in_another_scene(prior, smoothing):
+    frames, second = FRAMES.copy(), N // 2
+    frames[:second, :, :100], frames[second:, :, 540:] = 200, 200
+    detector = Performers(0.0)
+    options = {"method": "articulated", "fps": 30.0, "smoothing": smoothing}
+    (person,) = VideoTracker(prior, CAMERA, detector=detector, **options)(frames)
+    start, tracker = second + FIRST, UpperBodyTracker(prior, CAMERA, **options)
+    for first, last in ((FIRST, second), (start, N)):
+        rows = slice(first, last)
+        expected = tracker(
+            detector.points[None, rows, 0], detector.sure[None, rows, 0], detector.names
+        )
+        found = person.track.joints3d[:, first - FIRST : last - FIRST]
+        torch.testing.assert_close(found, expected.joints3d, rtol=1e-9, atol=1e-9)
+    assert not bool(person.track.joints3d[:, second - FIRST : start - FIRST].isfinite().any())
+
+
 def test_a_camera_gives_the_poses_of_a_recording(prior):
     tracker = VideoTracker(prior, CAMERA, detector=Performers(0.0))
     (person,) = tracker(FRAMES)

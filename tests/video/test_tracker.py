@@ -120,17 +120,51 @@ def test_a_step_of_a_frame_before_which_some_were_missed(prior, with_gaps):
 
 
 def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person):
+    """Behind a curtain that is drawn, and opened at once."""
     shown = one_person
-    nobody = [np.full_like(shown[0], 120)] * 80
+    closed = np.full_like(shown[0], 120)
+    closed[:, np.arange(closed.shape[1]) % 80 < 30] = 60  # folds
+    nobody = [shown[30].copy() for _ in range(80)]
+    for t, frame in enumerate(nobody):
+        frame[:, : 64 * t] = closed[:, : 64 * t]
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", max_gap=1.0)
     (person,) = tracker(shown[:30] + nobody + shown[30:])
     there = person.track.joints3d[0].isfinite().all(-1).all(-1)
     away = torch.nonzero(~there).flatten() + person.first_frame
     # for a second the face is followed blindly, for another one poses are inferred
-    assert 85 <= int(away[0]) <= 92 and 108 <= int(away[-1]) <= 116
+    assert 90 <= int(away[0]) <= 97 and 108 <= int(away[-1]) <= 116
     assert len(away) == int(away[-1]) - int(away[0]) + 1
     assert person.first_frame + len(person) == 140
     assert person.track.failed_at.tolist() == [-1]
+
+
+@pytest.mark.parametrize("options", [{"smoothing": "full"}, {"candidates": True}])
+def test_all_begins_anew_where_the_video_cuts_to_another_scene(prior, one_person, options):
+    """From there on the poses are those of the second scene alone."""
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", background=True, **options)
+    aside = [np.ascontiguousarray(np.roll(frame, 160, 1)) for frame in one_person[10:30]]
+    (alone,) = tracker(aside)
+    (joined,) = tracker(one_person[:12] + aside)  # the cut is within a block
+    assert joined.first_frame + len(joined) == 32
+    own = len(alone)
+    poses = joined.track.joints3d[0]
+    assert not bool(poses[-own - alone.first_frame : -own].isfinite().any())
+    torch.testing.assert_close(poses[-own:], alone.track.joints3d[0], rtol=0, atol=1e-9)
+    assert any("another scene at frame 12:" in note for note in joined.track.notes)
+    assert not any("another scene" in note for note in alone.track.notes)
+
+
+def test_all_begins_anew_before_a_camera(prior, one_person):
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
+    aside = [np.ascontiguousarray(np.roll(frame, 160, 1)) for frame in one_person[10:16]]
+    state, counts = tracker.init(), []
+    for frame in one_person[:6] + aside:
+        state, people = tracker.step(state, frame)
+        counts.append(len(people))
+    assert counts[5] == 1 and counts[6] == 0 and counts[-1] == 1
+    torch.testing.assert_close(
+        people[0].pose.joints3d, live_poses(tracker, aside)[-1:], rtol=0, atol=1e-9
+    )
 
 
 def live_poses(tracker, frames):

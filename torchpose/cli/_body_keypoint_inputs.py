@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.terminal import show_progress
+from torchpose._core.wording import first_of
 from torchpose.cli._track import OTHER_TABLES, is_video
 from torchpose.errors import FileFormatError, InputError, NobodySeenError, SkeletonError
 from torchpose.skeleton._mediapipe_landmarks import count_given
@@ -379,18 +380,35 @@ def _detect(
     with open_video(path, fps=fps) as source:
         measurer = _measurer(settings, source.fps)
         frames = list(_measured(measurer, source))
-        notes: tuple[str, ...] = ()
+        notes = _note_on_cuts(frames)
         if not everybody:
-            person, notes = _most_seen(frames)
+            person, others = _most_seen(frames)
+            notes += others
             frames = [_of_person(frame, person) for frame in frames]
         points, confidence = _table(frames, len(measurer.names))
         points, confidence = _of_body(settings.where, points, confidence, measurer.names)
         return CameraKeypoints(points, confidence, source.fps, source.size, (*source.notes, *notes))
 
 
+def _note_on_cuts(frames: "Sequence[FrameKeypoints]") -> tuple[str, ...]:
+    cuts = [t for t, frame in enumerate(frames) if frame.cut]
+    if not cuts:
+        return ()
+    return (
+        f"the video cuts to another scene at frame {first_of(cuts, 8)}, and bodies are tracked on: split it "
+        "there",
+    )
+
+
 def _of_person(frame: "FrameKeypoints", person: int) -> "FrameKeypoints":
     rows = frame.person == person
-    return type(frame)(*(value[rows] for value in frame))
+    return frame._replace(
+        person=frame.person[rows],
+        keypoints=frame.keypoints[rows],
+        confidence=frame.confidence[rows],
+        sizes=frame.sizes[rows],
+        absent=frame.absent[rows],
+    )
 
 
 def _table(frames: "Sequence[FrameKeypoints]", n_joints: int) -> tuple[Tensor, Tensor]:

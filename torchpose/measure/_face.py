@@ -145,6 +145,10 @@ class FaceTracker(nn.Module):
             whole.clone(), 0, 0,
         )  # fmt: skip
 
+    def begin_anew(self, tracks: FaceTracks) -> FaceTracks:
+        """Return the state without faces for another scene of the same video."""
+        return self.init()._replace(next_identity=tracks.next_identity)
+
     def usable(self, tracks: FaceTracks) -> Bool[Tensor, " N"]:
         """Return which tracks have enough detections to be used, and are no pattern beside another person."""
         enough = tracks.hits >= self.min_hits

@@ -27,6 +27,7 @@ from torchpose.measure._detectors.protocol import (
     checked_detections,
 )
 from torchpose.measure._persons import PersonRegister, Persons, largest_persons
+from torchpose.measure._scene_cuts import SceneCuts, SceneState
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 
@@ -49,6 +50,7 @@ class FrameKeypoints(NamedTuple):
         keypoints: of the measurer's `names` [N, J, 2], pixels, NaN where missing.
         confidence: 0 to 1 [N, J]. sizes: about the widths of the shoulders, pixels [N].
         absent: the probability that a keypoint cannot be seen, NaN where nothing is known [N, J].
+        cut: whether the video cuts to another scene before this frame.
     """
 
     person: Int[Tensor, " N"]
@@ -56,6 +58,7 @@ class FrameKeypoints(NamedTuple):
     confidence: Float[Tensor, "N J"]
     sizes: Float[Tensor, " N"]
     absent: Float[Tensor, "N J"]
+    cut: bool = False
 
     @property
     def faces(self) -> None:
@@ -67,13 +70,14 @@ class KeypointState(NamedTuple):
     """Holds the tracks of the persons, who they are, and the number of frames before.
 
     Attributes:
-        followed: numbers of those who count [n].
+        followed: numbers of those who count [n]. scene: of `SceneCuts`.
     """
 
     tracks: PersonTracks
     persons: Persons
     frame: int
     followed: Int[Tensor, " n"]
+    scene: SceneState
 
 
 class KeypointMeasurer:
@@ -81,7 +85,8 @@ class KeypointMeasurer:
 
     A frame passes four stages: detection, of crops about the persons where the detector wants one person;
     removal of what is unsure or there twice; association with the persons of the frames before, by the
-    distances of the keypoints; and recognition of who returns, by the colours of the clothes.
+    distances of the keypoints; and recognition of who returns, by the colours of the clothes. Where the
+    video cuts to another scene, the tracks begin anew.
 
     Args:
         detector: of keypoints. fps: frames per second.
@@ -121,14 +126,15 @@ class KeypointMeasurer:
         self._upper = upper_rows(self.names)
         self._anywhere = torch.tensor([one in _ANYWHERE for one in canonical_names(self.names)])
         self.register = PersonRegister(within=round(_KNOWN_FOR * fps))
+        self.scene_cuts = SceneCuts(fps)
 
     def init(self) -> KeypointState:
         """Return the state before the first frame, and reset the detector."""
         reset = getattr(self.detector, "reset", None)
         if callable(reset):
             reset()
-        persons = self.register.init()
-        return KeypointState(no_tracks(len(self.names)), persons, 0, persons.last_seen)
+        persons, scene = self.register.init(), self.scene_cuts.init()
+        return KeypointState(no_tracks(len(self.names)), persons, 0, persons.last_seen, scene)
 
     def step(self, state: KeypointState, image: Image) -> tuple[KeypointState, FrameKeypoints]:
         """Return the next state and the keypoints of the next frame.
@@ -140,6 +146,11 @@ class KeypointMeasurer:
             InputError: another kind of image, or a detector that returns something else than it says.
         """
         check_rgb("a frame", image)
+        scene, cut = self.scene_cuts.step(state.scene, image)
+        if cut:
+            nobody = no_tracks(len(self.names))
+            following = state.tracks.next_identity
+            state = state._replace(tracks=nobody._replace(next_identity=following))
         found = self._sure(self._detect(state.tracks, image), image)
         scale = self._scale(found.keypoints)[1]
         found = _rows(found, without_doubles(Detections(*found[:2]), scale, self._upper))
@@ -150,8 +161,10 @@ class KeypointMeasurer:
         chosen = torch.nonzero(torch.isin(number[owner], followed)).flatten()
         found, number = _rows(found, chosen), number[owner][chosen]
         size = self._scale(found.keypoints)[1]
-        measured = FrameKeypoints(number, found.keypoints, found.confidence, size, found.absent)
-        return KeypointState(tracks, persons, state.frame + 1, followed), measured
+        measured = FrameKeypoints(
+            number, found.keypoints, found.confidence, size, found.absent, cut
+        )
+        return KeypointState(tracks, persons, state.frame + 1, followed, scene), measured
 
     def _detect(self, tracks: PersonTracks, image: Image) -> Detections:
         """Return all keypoints of a frame."""

@@ -30,6 +30,7 @@ from torchpose.measure._persons import (
     measure_by_scale,
     take_rows,
 )
+from torchpose.measure._scene_cuts import SceneCuts, SceneState
 from torchpose.measure._skin import SkinState, rgb_to_lab
 from torchpose.measure._torso_elbows import Elbows, clothes_likelihood, elbows_from_torso
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -55,6 +56,7 @@ class FrameMeasurements(NamedTuple):
         person: their numbers, in the order of appearance [N].
         keypoints: of the measurer's `names` [N, J, 2], NaN where missing. covariance: [N, J, 2, 2].
         faces: (x, y, size) [N, 3]. hands: of the hand tracker.
+        cut: whether the video cuts to another scene before this frame.
     """
 
     person: Int[Tensor, " N"]
@@ -62,6 +64,7 @@ class FrameMeasurements(NamedTuple):
     covariance: Float[Tensor, "N J 2 2"]
     faces: Float[Tensor, "N 3"]
     hands: HandMeasurements
+    cut: bool = False
 
     @property
     def absent(self) -> Float[Tensor, "N J"]:
@@ -84,6 +87,7 @@ class SeenPersons(NamedTuple):
     Attributes:
         faces, persons: tracked and numbered. windows: about the faces; None for mean shift.
         frame: number of frames before. followed: numbers of those who were measured last [n].
+        scene: of `SceneCuts`.
     """
 
     faces: FaceTracks
@@ -91,6 +95,7 @@ class SeenPersons(NamedTuple):
     windows: HandWindowState | None
     frame: int
     followed: Int[Tensor, " n"]
+    scene: SceneState
 
 
 class PersonsView(NamedTuple):
@@ -100,6 +105,7 @@ class PersonsView(NamedTuple):
         after: the state for the next frame. faces: (x, y, size) [N, 3]. covariance: [N, 3, 3].
         number: of each person. foreground: of the background model, if any.
         hands: what windows show; None for mean shift, and without persons.
+        cut: whether the video cuts to another scene before this frame.
     """
 
     after: SeenPersons
@@ -108,6 +114,7 @@ class PersonsView(NamedTuple):
     number: Int[Tensor, " N"]
     foreground: Image | None
     hands: HandView | None
+    cut: bool
 
 
 class MeasurerState(NamedTuple):
@@ -121,7 +128,8 @@ class UpperBodyMeasurer(nn.Module):
     """Measures head, neck and hands of all persons in a video, frame by frame.
 
     Faces are detected and tracked. They give head and neck, the colours of skin, and the region of the
-    hands.
+    hands. Where the video cuts to another scene, all begins anew, and only the clothes by which persons
+    are recognised are kept.
 
     Args:
         prior: of poses; gives the density of hands relative to the face.
@@ -170,6 +178,7 @@ class UpperBodyMeasurer(nn.Module):
         offsets = FACE_OFFSETS if self.learnt and measured else WITHOUT_ELBOWS
         self.head_neck = HeadNeck(offsets) if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * fps))
+        self.scene_cuts = SceneCuts(fps)
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":
             network = shipped_hand_network() if self.learnt else None
@@ -182,14 +191,17 @@ class UpperBodyMeasurer(nn.Module):
 
     def init(self) -> MeasurerState:
         """Return the state before the first frame, and reset the background model."""
-        if self.background is not None:
-            self.background.reset()
-        persons = self.register.init()
-        seen = SeenPersons(self.face_tracker.init(), persons, None, 0, persons.last_seen)
+        self._forget_background()
+        persons, scene = self.register.init(), self.scene_cuts.init()
+        seen = SeenPersons(self.face_tracker.init(), persons, None, 0, persons.last_seen, scene)
         if isinstance(self.hand_tracker, HandTracker):
             windows, beliefs = self.hand_tracker.init()
             return MeasurerState(seen._replace(windows=windows), beliefs)
         return MeasurerState(seen, self.hand_tracker.init())
+
+    def _forget_background(self) -> None:
+        if self.background is not None:
+            self.background.reset()
 
     @as_one_run
     def look(self, seen: SeenPersons, image: Image) -> PersonsView:
@@ -206,6 +218,11 @@ class UpperBodyMeasurer(nn.Module):
         Raises:
             InputError: another kind of image.
         """
+        check_rgb("a frame", image)
+        scene, cut = self.scene_cuts.step(seen.scene, image)
+        if cut:  # without faces, hands are forgotten as well
+            self._forget_background()
+            seen = seen._replace(faces=self.face_tracker.begin_anew(seen.faces))
         tracks = self._follow_faces(seen.faces, image)
         faces, face_cov, identity, unseen = self._used(tracks, image)
         detected = unseen <= 2 * self.face_tracker.every
@@ -219,14 +236,13 @@ class UpperBodyMeasurer(nn.Module):
         windows, hands = seen.windows, None
         if isinstance(self.hand_tracker, HandTracker) and windows is not None:
             windows, hands = self.hand_tracker.look(windows, image, faces, number, foreground)
-        after = SeenPersons(tracks, persons, windows, seen.frame + 1, number)
-        return PersonsView(after, faces, face_cov, number, foreground, hands)
+        after = SeenPersons(tracks, persons, windows, seen.frame + 1, number, scene)
+        return PersonsView(after, faces, face_cov, number, foreground, hands, cut)
 
     def _follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
         """Return the faces of the next frame, in pixels of a smaller image where the frame is large."""
         import cv2
 
-        check_rgb("a frame", image)
         if not self.face_tracker.searches(tracks):
             return self.face_tracker.step(tracks, None)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -272,7 +288,8 @@ class UpperBodyMeasurer(nn.Module):
         cov = torch.cat([own.to(faces) for _, own in parts], 1)
         eye = torch.eye(2, dtype=cov.dtype)
         cov = torch.where(keypoints.isfinite().all(-1)[..., None, None], cov, eye)
-        measured = FrameMeasurements(number, keypoints, rounded_covariance(cov), faces, hands)
+        cov = rounded_covariance(cov)
+        measured = FrameMeasurements(number, keypoints, cov, faces, hands, view.cut)
         return MeasurerState(view.after, hand_state), measured
 
     def _hands(

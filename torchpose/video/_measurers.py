@@ -30,6 +30,7 @@ class MissedFrame(NamedTuple):
 
     person: Int[Tensor, " 0"] = torch.zeros(0, dtype=torch.long)
     faces: None = None
+    cut: bool = False
 
 
 Found = FrameMeasurements | FrameKeypoints | MissedFrame
@@ -54,11 +55,13 @@ class MeasuredBlock(NamedTuple):
     Attributes:
         images: the frames, if anything uses them; else none. Missed frames have the image of the next one.
         found: the measurements in each. state: after the last.
+        cut: whether the video cuts to another scene before the first frame; a block holds one scene.
     """
 
     images: list[Image]
     found: list[Found]
     state: Any
+    cut: bool
 
 
 @runtime_checkable
@@ -209,24 +212,33 @@ def measure_blocks(
 
     Args:
         measurer: measures the persons. state: its state before the frames. frames: from `look_ahead`.
-        size: the least number of frames of a block; the last one may be shorter.
+        size: the least number of frames of a block; the last one of a scene may be shorter.
         keep: whether blocks hold their images.
     """
-    images: list[Image] = []
-    found: list[Found] = []
+    joined: MeasuredBlock | None = None
     for frame in frames:
         state, one = measurer.step(state, frame)
         block = block_of(frame, one, state)
-        images += block.images if keep else []
-        found += block.found
-        if len(found) >= size:
-            yield MeasuredBlock(images, found, state)
-            images, found = [], []
-    if found:
-        yield MeasuredBlock(images, found, state)
+        if not keep:
+            block = block._replace(images=[])
+        if joined is not None and block.cut:
+            yield joined
+            joined = None
+        joined = block if joined is None else _join(joined, block)
+        if len(joined.found) >= size:
+            yield joined
+            joined = None
+    if joined is not None:
+        yield joined
+
+
+def _join(first: MeasuredBlock, second: MeasuredBlock) -> MeasuredBlock:
+    """Return two blocks of one scene as one."""
+    images, found = first.images + second.images, first.found + second.found
+    return MeasuredBlock(images, found, second.state, first.cut)
 
 
 def block_of(frame: SeenFrame, found: Found, state: Any) -> MeasuredBlock:
     """Return a frame and those missed before it, given its measurements and the state after it."""
     missed = [MissedFrame()] * frame.missed
-    return MeasuredBlock([frame.image] * (1 + frame.missed), [*missed, found], state)
+    return MeasuredBlock([frame.image] * (1 + frame.missed), [*missed, found], state, found.cut)

@@ -5,6 +5,7 @@ import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.facade import set_up_facade
+from torchpose._core.wording import first_of
 from torchpose.errors import InputError, OutputError
 from torchpose.upper_body._outlier_notes import (
     exchanged_frames,
@@ -31,6 +33,7 @@ from torchpose.video._person_stream import (
 )
 
 _LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
+_MOST_CUTS = 8  # that a note lists
 
 
 class PoseSpool:
@@ -171,16 +174,22 @@ class TrackedRecording:
         self.tracker, self.names, self.gap, self.folder = tracker, tuple(names), gap, folder
         self.n_frames = 0
         self._people: dict[int, _Person] = {}
+        self._cuts: list[int] = []
 
-    def append(self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int) -> None:
+    def append(
+        self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int, cut: bool = False
+    ) -> None:
         """Keep the poses of the next block.
 
         Args:
             tracked: the parts of the block with poses, by person. n_frames: the length of the block.
+            cut: whether another scene begins with the block.
 
         Raises:
             OutputError: the disk is full.
         """
+        if cut:
+            self._cuts.append(self.n_frames)
         for number, parts in tracked.items():
             for part in parts:
                 self._keep(number, part)
@@ -222,14 +231,45 @@ class TrackedRecording:
         fields = (_joined(parts, count) for parts in zip(*person.measured, strict=True))
         measured = Measured(*fields)  # type: ignore[arg-type]
         track = person.poses.track(count)
-        track = replace(track, first_frame=person.first_frame)
+        track = replace(
+            track, first_frame=person.first_frame, notes=track.notes + _note_on_cuts(self._cuts)
+        )
         found = TrackedPerson(
             person.number, person.first_frame, track, measured.keypoints, measured.covariance,
             measured.confidence, measured.absent,
         )  # fmt: skip
-        if smoother is None:
-            return found
-        return replace(found, track=smoothed(found, smoother, self.names, self.gap))
+        return found if smoother is None else self._smoothed(found, smoother)
+
+    def _smoothed(self, person: TrackedPerson, smoother: UpperBodyTracker) -> TrackedPerson:
+        """Return a person with smoothed poses: of each scene from the measurements in it."""
+        seen = person.keypoints.isfinite().flatten(1).any(1)
+        cuts = [cut - person.first_frame for cut in self._cuts]
+        bounds = [0, *(cut for cut in cuts if 0 < cut < len(person)), len(person)]
+        poses = PoseSpool(self.folder)
+        for start, stop in pairwise(bounds):
+            there = torch.nonzero(seen[start:stop]).flatten().tolist()
+            first = start + there[0] if there else stop
+            if first > start:
+                poses.append(_nobody(first - start, self.tracker))
+            if first < stop:
+                part = _part_of(person, slice(first, stop))
+                poses.append(smoothed(part, smoother, self.names, self.gap))
+        track = poses.track()
+        notes = track.notes + _note_on_cuts(self._cuts)
+        return replace(person, track=replace(track, first_frame=person.first_frame, notes=notes))
+
+
+def _part_of(person: TrackedPerson, rows: slice) -> TrackedPerson:
+    """Return a person with the measurements of some of the frames."""
+    own = (person.covariance, person.confidence, person.absent)
+    covariance, confidence, absent = (None if values is None else values[rows] for values in own)
+    return replace(
+        person,
+        keypoints=person.keypoints[rows],
+        covariance=covariance,
+        confidence=confidence,
+        absent=absent,
+    )
 
 
 def smoothed(
@@ -252,6 +292,16 @@ def smoothed(
     seen = person.keypoints.isfinite().flatten(1).any(1)
     track = without_long_gaps(track, seen, 0, gap)
     return replace(track, first_frame=person.first_frame)
+
+
+def _note_on_cuts(cuts: Sequence[int]) -> tuple[str, ...]:
+    if not cuts:
+        return ()
+    where = f"{'frame' if len(cuts) == 1 else 'frames'} {first_of(cuts, _MOST_CUTS)}"
+    return (
+        f"the video cuts to another scene at {where}: everybody is found anew there, and recognised by "
+        "the clothes",
+    )
 
 
 def _joined(parts: Sequence[Tensor | None], count: int) -> Tensor | None:

@@ -107,8 +107,9 @@ class VideoTracker(nn.Module):
     `forward` tracks a recording, `init` and `step` a camera, `advance` some more frames of either. A frame
     passes three stages, each of which takes and returns values: `Measurer.look` sees what images alone tell,
     `Measurer.step` measures the persons, and `PersonStream.advance_all` turns the measurements into poses
-    by the `UpperBodyTracker`. Of a recording the first runs ahead in a thread, that of a detector the second
-    too, and the poses are kept in files until it has ended (`TrackedRecording`).
+    by the `UpperBodyTracker`. Where the video cuts to another scene, all of them begin anew. Of a recording
+    the first runs ahead in a thread, that of a detector the second too, and the poses are kept in files
+    until it has ended (`TrackedRecording`).
 
     Args:
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
@@ -322,7 +323,7 @@ class VideoTracker(nn.Module):
             tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
         ):
             for state, block, tracked in blocks:
-                recording.append(tracked, len(block.found))
+                recording.append(tracked, len(block.found), block.cut)
                 bar.update(len(block.found))
                 if watch is not None:
                     for _ in block.found:
@@ -378,8 +379,9 @@ class VideoTracker(nn.Module):
         self, state: VideoState, block: MeasuredBlock
     ) -> tuple[VideoState, dict[int, list[TrackedBlock]]]:
         """Return the next state and the poses in a block of measured frames."""
-        images, found, own = block
-        streams, tracked = self.stream.advance_all(state.streams, found, images, self.gap)
+        images, found, own, cut = block
+        before = {} if cut else state.streams
+        streams, tracked = self.stream.advance_all(before, found, images, self.gap)
         last = {number: tracked[number][-1].poses for number in streams}
         poses = {number: pose for number, pose in last.items() if _ends_in_pose(pose)}
         return VideoState(own, streams, poses), tracked
