@@ -350,6 +350,21 @@ def test_a_detector_finds_the_keypoints_in_videos(track, scene, tmp_path, monkey
     assert not (tmp_path / "b" / "body.npz").exists()
 
 
+def test_cuts_of_a_video_are_noted(track, scene, tmp_path, monkeypatch):
+    text = DETECTOR.format(points=str(scene[0] / "points.npy"), names=BODY_15.names)
+    (tmp_path / "cut_detectors.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    image[:, : WIDTH // 4] = 200
+    with VideoWriter(tmp_path / "cut.mp4", FPS, (WIDTH, HEIGHT)) as writer:
+        for t in range(N):
+            writer.write(image if t < 4 else np.ascontiguousarray(image[:, ::-1]))
+    alone = (tmp_path / "cut.mp4", "--camera-names", "[front]", *PLAIN)
+    done = track(tmp_path / "out", *alone, "--detector", "cut_detectors:front")
+    assert done.code == 0, done.err
+    assert "cuts to another scene at frame 4, and bodies are tracked on" in done.out
+
+
 def test_inputs_of_other_lengths_sizes_and_rates(track, scene, tmp_path):
     points = scene[2]
     write_keypoints(tmp_path / "short.npz", keypoints_of(points[:-2, 2]))
