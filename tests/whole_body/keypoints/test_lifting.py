@@ -13,8 +13,10 @@ from torchpose.body import BODY_15, Body
 from torchpose.body._skeleton import other_side
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import FileFormatError
+from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
+from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_start import _points
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
@@ -36,6 +38,8 @@ from torchpose.whole_body._keypoints.lifting_network import (
 PELVIS = BODY_15.joint("pelvis")
 LEGS = [i for i, name in enumerate(BODY_15.names) if name.endswith(("knee", "ankle"))]
 KNEES = [BODY_15.joint("left_knee"), BODY_15.joint("right_knee")]
+SHOULDERS = [BODY_15.joint(name) for name in ("left_shoulder", "right_shoulder", "neck")]
+ANKLES = [BODY_15.joint("left_ankle"), BODY_15.joint("right_ankle")]
 LIMBS = [
     i for i, name in enumerate(BODY_15.names) if name.endswith(("elbow", "wrist", "knee", "ankle"))
 ]
@@ -191,6 +195,64 @@ def test_a_camera_on_its_side_lifts_the_same_where_up_is_known():
     )
     torch.testing.assert_close(on_side.joints, usual.joints, atol=1e-4, rtol=0)
     torch.testing.assert_close(on_side.std, usual.std, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_body_that_lies_is_lifted_as_one_that_stands(quarters):
+    """Turned about the optical axis, a body looks as in a camera that is turned the other way."""
+    motion, rig, joints = load_body_motion("whole-body"), ring(1), moving_body(1)
+    axis = quarters * torch.pi / 2 * rig.rotation[0, 2]
+    turn = rotvec_to_matrix(axis)
+    centre = -rig.rotation[0].mT @ rig.translation[0]
+    lifter = PoseLifter(rig, FPS, motion)
+    usual, lying = (
+        lifter(frame_of(rig(body).pixels), None)[0]
+        for body in (joints, (joints - centre) @ turn.mT + centre)
+    )
+    expected = usual.joints[:, LIMBS] @ turn.mT
+    off = (lying.joints[:, LIMBS] - expected).norm(dim=-1)
+    assert float(off.max()) < 0.1  # the turn is that of trunk and legs, not of the floor
+    assert float(off.mean()) < 0.05
+
+
+def test_who_bends_or_sits_with_stretched_legs_is_not_taken_to_lie():
+    upright = torch.tensor([[0.0, -1.0]], dtype=torch.float64)
+    hips, long = torch.zeros(2, dtype=torch.float64), 0.2
+    for trunk, legs, expected in (
+        ((0.9, 0.3), (0.0, -1.0), (0.0, -1.0)),  # bends
+        ((0.0, -1.0), (1.0, 0.0), (0.0, -1.0)),  # sits with stretched legs
+        ((1.0, 0.0), (-1.0, -0.2), (0.0, -1.0)),  # bends in a seat, seen from above
+        ((1.0, -0.1), (1.0, 0.1), (1.0, 0.0)),  # lies
+        ((0.1, 1.0), (-0.1, 1.0), (0.0, 1.0)),  # stands on the hands
+    ):
+        rays = torch.zeros(1, 15, 2, dtype=torch.float64)
+        rays[0, SHOULDERS] = hips + long * torch.tensor(trunk, dtype=torch.float64)
+        rays[0, ANKLES] = hips - long * torch.tensor(legs, dtype=torch.float64)
+        there = torch.ones(1, 15, dtype=torch.bool)
+        roll, turned = next_roll(BodyRoll.upright(rays[:, 0, 0]), rays, there, FPS)
+        torch.testing.assert_close(roll.up[0].tolist(), list(expected), atol=1e-9, rtol=0)
+        assert bool(turned) == (expected != (0.0, -1.0))
+        one_hip = there.clone()
+        one_hip[:, [PELVIS, BODY_15.joint("left_hip")]] = False
+        untold, _ = next_roll(BodyRoll.upright(rays[:, 0, 0]), rays, one_hip, FPS)
+        assert torch.equal(untold.up, upright)
+
+
+def test_a_body_that_lies_is_turned_until_it_stands_up():
+    up = torch.tensor([[[0.0, -1.0]], [[1.0, 0.0]]], dtype=torch.float64)
+    there = torch.ones(1, 15, dtype=torch.bool)
+    rays = torch.zeros(2, 1, 15, 2, dtype=torch.float64)
+    rays[..., SHOULDERS, :] = up[:, :, None]
+    rays[..., ANKLES, :] = -up[:, :, None]
+    roll = BodyRoll.upright(rays[0, :, 0, 0])
+    changes = []
+    for seen in (*[rays[0]] * 30, rays[1], *[rays[0]] * 30, *[rays[1]] * 30, *[rays[0]] * 30):
+        roll, turned = next_roll(roll, seen, there, FPS)
+        changes.append(bool(turned))
+    first, second = (t for t, turned in enumerate(changes) if turned)
+    assert 61 < first < 91 < second  # not for the single frame
+    assert torch.equal(roll.up, up[0])
+    torch.testing.assert_close(roll.turn[0], torch.eye(3, dtype=torch.float64), atol=0, rtol=0)
 
 
 def quarter_turned(rig):

@@ -8,6 +8,7 @@ from torchpose.body._articulation import BodyPoint
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
 from torchpose.whole_body._keypoints.body_size import SizeBelief
 from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults
+from torchpose.whole_body._keypoints.lifted_pose import LifterMemory
 
 
 class KeypointStream(NamedTuple):
@@ -18,7 +19,7 @@ class KeypointStream(NamedTuple):
         lost: [B], for how many frames in a row most keypoints have been of something else, or there were
             none, which counts half, or the person has waited for a start.
         alone: [B], which of several cameras alone the person is followed by, -1 if by all.
-        memory: [B, L, W], of the network that lifts keypoints of one camera.
+        memory: of [B], of what lifts keypoints of one camera.
         faults: of the cameras, as each person tells them.
         size: of [B], of the only camera, in which the filter does not tell it.
         spread: [B, J], metres, standard deviations of the network's joints in the last frame that it lifted.
@@ -29,7 +30,7 @@ class KeypointStream(NamedTuple):
     begun: Tensor
     lost: Tensor
     alone: Tensor
-    memory: Tensor
+    memory: LifterMemory
     faults: CameraFaults
     size: SizeBelief
     spread: Tensor

@@ -38,8 +38,13 @@ from torchpose.whole_body._keypoints.keypoint_poses import (
 )
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
 from torchpose.whole_body._keypoints.known_person import of_one_camera, std_of_legs
-from torchpose.whole_body._keypoints.lifted_pose import PoseLifter, contradicts, corrected_by
-from torchpose.whole_body._keypoints.lifting_network import MEMORY, Lifted
+from torchpose.whole_body._keypoints.lifted_pose import (
+    LifterMemory,
+    PoseLifter,
+    contradicts,
+    corrected_by,
+)
+from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.lone_camera import (
     NOBODY,
     SAME_NOISE,
@@ -52,6 +57,7 @@ from torchpose.whole_body._keypoints.lone_camera import (
 from torchpose.whole_body._keypoints.nested import (
     FrameCollector,
     frame_at,
+    mapped,
     part_of,
     replaced,
     taken,
@@ -376,25 +382,26 @@ class KeypointTracker(nn.Module):
 
     def _lifted(
         self, stream: KeypointStream | None, frame: KeypointFrame
-    ) -> tuple[Float[Tensor, "B L W"], Lifted | None]:
-        """Return the state of the recurrent network, and what it lifts in a frame of one camera."""
+    ) -> tuple[LifterMemory, Lifted | None]:
+        """Return what the lifter remembers, and what it lifts in a frame of one camera."""
+        before = None if stream is None else stream.memory
         if self.lifter is None:
-            return self._no_memory(frame) if stream is None else stream.memory, None
-        lifted, memory = self.lifter(frame, None if stream is None else stream.memory)
+            return before or LifterMemory.none(frame.inlier[:, 0, 0]), None
+        lifted, memory = self.lifter(frame, before)
         return memory, lifted
 
-    def _recalled(self, stream: KeypointStream, frame: KeypointFrame) -> Float[Tensor, "B L W"]:
-        """Return the state of the recurrent network, that of a beginning where nobody has been seen for long.
+    def _recalled(self, stream: KeypointStream, frame: KeypointFrame) -> LifterMemory:
+        """Return what the lifter remembers, nothing where nobody has been seen for long.
 
         Otherwise it would lift somebody who returns to the pose of who left for half a second.
         """
         nobody = ~(frame.inlier > 0).flatten(1).any(-1)
-        gone = nobody & (stream.lost > _LOST_TIME * self.filter.fps)
-        return stream.memory.masked_fill(gone[:, None, None], 0.0)
-
-    def _no_memory(self, frame: KeypointFrame) -> Float[Tensor, "B L W"]:
-        """Return the state of the recurrent network before the first frame."""
-        return torch.zeros(len(frame.inlier), *MEMORY, device=frame.inlier.device)
+        rows = (nobody & (stream.lost > _LOST_TIME * self.filter.fps)).nonzero().squeeze(-1)
+        if not len(rows):
+            return stream.memory
+        none = LifterMemory.none(stream.lost[rows])
+        none = mapped(lambda new, own: new.to(own), none, stream.memory)
+        return replaced(stream.memory, rows, none)
 
     def _followed(
         self, frame: KeypointFrame, lifted: Lifted | None, predicted: BodyGaussian

@@ -1,7 +1,8 @@
 """Lift the keypoints of one camera to a pose, which the filter takes for another measurement of the frame.
 
 One camera does not see the depth of limbs. A network that has seen many poses tells the joints l_j that go
-with the keypoints, and their standard deviations s_j. The filter is corrected by
+with the keypoints, and their standard deviations s_j. It has seen people who are upright, so keypoints of
+others are turned about the optical axis first (`body_roll`). The filter is corrected by
 
     l_j = p_j(x) - p_pelvis(x) + e_j,   e_j ~ N(0, (1.5 s_j)^2 I),
 
@@ -22,9 +23,11 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
+from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.known_person import length_of_legs
 from torchpose.whole_body._keypoints.lifting_network import (
+    MEMORY,
     Lifted,
     lifting_features,
     shipped_lifting_network,
@@ -44,6 +47,19 @@ _NEAREST = 0.5  # metres from the camera
 _LEAST_UP = 0.2  # share of the upward direction in the image plane, below which it tells no roll
 _PELVIS = BODY_15.joint("pelvis")
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
+
+
+class LifterMemory(NamedTuple):
+    """Holds what is known of persons from earlier frames: the network's state [B, L, W], how they point."""
+
+    network: Tensor
+    roll: BodyRoll
+
+    @classmethod
+    def none(cls, like: Float[Tensor, " B"]) -> Self:
+        """Return the memory before the first frame."""
+        network = torch.zeros(len(like), *MEMORY, device=like.device)
+        return cls(network, BodyRoll.upright(like))
 
 
 class _UprightView(NamedTuple):
@@ -98,20 +114,27 @@ class PoseLifter(nn.Module):
         return derived(self, "view", sources, lambda: _UprightView.of(rig, self.up))
 
     def forward(
-        self, frame: KeypointFrame, memory: Float[Tensor, "B L W"] | None
-    ) -> tuple[Lifted, Float[Tensor, "B L W"]]:
-        """Return joints relative to the pelvis in world axes, and the state of the recurrent network.
+        self, frame: KeypointFrame, memory: LifterMemory | None
+    ) -> tuple[Lifted, LifterMemory]:
+        """Return joints relative to the pelvis in world axes, and what is known after the frame.
 
         Args:
             frame: of keypoints. memory: of the frame before; None at the beginning.
         """
         sure = frame.inlier[:, 0]
-        rays = self._rays(frame)[..., :2]
-        seen = lifting_features(rays, sure, self.fps).to(self.network.places.weight)
-        lifted, memory = self.network(seen[:, None], memory)
+        memory = LifterMemory.none(sure[:, 0]) if memory is None else memory
+        rays = self._rays(frame)
+        roll, turned = next_roll(memory.roll, rays[..., :2], sure > 0, self.fps)
+        seen = lifting_features((rays @ roll.turn.mT)[..., :2], sure, self.fps)
+        before = memory.network.masked_fill(turned[:, None, None], 0.0)
+        seen, before = (value.to(self.network.places.weight) for value in (seen, before))
+        lifted, after = self.network(seen[:, None], before)
         joints, std = (self.size * value[:, 0].to(rays) for value in lifted)
         enough = (sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS
-        return Lifted(joints @ self.view.rotation, torch.where(enough, std, torch.inf)), memory
+        lifted = Lifted(
+            joints @ roll.turn @ self.view.rotation, torch.where(enough, std, torch.inf)
+        )
+        return lifted, LifterMemory(after, roll)
 
     def placed(self, lifted: Lifted, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
         """Return lifted joints in the world, where they lie near the rays of their keypoints.
@@ -132,12 +155,10 @@ class PoseLifter(nn.Module):
 
 def _upright_roll(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Return the rotation about the optical axis that turns an upward direction to -y in the image."""
-    x, y = (-up[:2]).tolist()
-    long = (x * x + y * y) ** 0.5
-    if long < _LEAST_UP:  # the camera looks down or up, and any roll is as good
+    length = float(up[:2].norm())
+    if length < _LEAST_UP:  # the camera looks down or up, and any roll is as good
         return torch.eye(3).to(up)
-    x, y = x / long, y / long
-    return torch.tensor([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]).to(up)
+    return turn_upright(up[:2] / length)
 
 
 def place_on_rays(
