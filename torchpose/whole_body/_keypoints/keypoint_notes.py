@@ -262,12 +262,13 @@ def notes_on_a_rolled_camera(
         return (
             f"the person is upside down in most images of camera {name}, which is taken to be level since no "
             "up is given; v of keypoints is to be counted downwards from the upper edge of an image. If the "
-            "camera hangs that way, give up (--up), the axis of the world that points up, or turn the images",
+            "camera hangs that way, and not the person, give up (--up), the axis of the world that points "
+            "up, or turn the images",
         )
     return (
         f"the person leans by {leans:.0f} degrees or more in most images of camera {name}, which is taken "
-        "to be level since no up is given; if the camera is rolled, or its video turned, give up (--up), the "
-        "axis of the world that points up, or turn the images",
+        "to be level since no up is given; if the camera is rolled, or its video turned, and the "
+        "person does not lie, give up (--up), the axis of the world that points up, or turn the images",
     )
 
 
