@@ -11,13 +11,14 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR --noise-alone --methods kalman kalman-smoothed pose2sim
     python -m benchmarks.keypoint_bodies --data DIR --heights [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --sitting [--lifters FILE]
+    python -m benchmarks.keypoint_bodies --data DIR --lying [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
 The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
-is. The fourth shows people who sit to one camera. The fifth prints what the constants of the filters of
-single joints were chosen by. The sixth fits the network that comes with torchpose and lifts the keypoints of
-one camera.
+is. The fourth shows people who sit to one camera, the fifth people who lie. The sixth prints what the
+constants of the filters of single joints were chosen by. The seventh fits the network that comes with
+torchpose and lifts the keypoints of one camera.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from benchmarks.keypoint_bodies.clips import (
     read_kinect,
 )
 from benchmarks.keypoint_bodies.lifting import fit_shipped
+from benchmarks.keypoint_bodies.lying import add_lying_table
 from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, Method, methods_of, takes
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.sitting import add_sitting_table
@@ -69,6 +71,7 @@ def main(
     noise_alone: bool = False,
     heights: bool = False,
     sitting: bool = False,
+    lying: bool = False,
     choose: bool = False,
     fit: Path | None = None,
     quick: bool = False,
@@ -84,6 +87,7 @@ def main(
         noise_alone: whether keypoints have noise and nothing else, in several cameras only.
         heights: whether one camera is told how high it is, in place of the tables.
         sitting: whether people sit, seen by one camera, in place of the tables.
+        lying: whether people lie, seen by one camera, in place of the tables.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
@@ -101,7 +105,7 @@ def main(
         clips = {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
     if choose:
         add_choices(report, clips)
-    elif heights or sitting:
+    elif heights or sitting or lying:
         chosen = {
             name: one
             for name, one in methods_of(methods, data, lifters, quick).items()
@@ -109,6 +113,8 @@ def main(
         }
         if sitting:
             add_sitting_table(report, chosen, data, quick)
+        elif lying:
+            add_lying_table(report, chosen, data, quick)
         else:
             _add_heights(report, chosen, clips, data, quick)
     else:

@@ -219,6 +219,15 @@ def test_quick_run_prints_people_who_sit(run_here):
     assert "pose2sim" not in printed  # takes several cameras
 
 
+def test_quick_run_prints_people_who_lie(run_here):
+    data = data_dir_or_skip(MHAD).parent
+    printed = run_here(
+        "keypoint_bodies.__main__", "--data", str(data), "--quick", "--lying", "--methods", "kalman"
+    )
+    for row in ("lying, across", "upside down", "camera on its side", "standing, level camera"):
+        assert f"| kalman *, {row} |" in printed
+
+
 def test_turned_rings_see_the_same_body_from_other_sides(walker):
     ahead, beside = (see(walker, faults=CLEAN, turn=turn) for turn in (0.0, 90.0))
     first, second = (clip.rig.rotation[0, 2] for clip in (ahead, beside))
