@@ -446,6 +446,7 @@ class ArticulatedFilter(Estimator):
             limbs=seen.frame.limbs,
             whole=seen.facts.whole,
             exact=seen.frame.exact,
+            std=torch.where(seen.frame.known, seen.frame.std, 0.0),
             lengths=seen.sizes.metres,
             bones=self.lengths.shown(seen.lengths, seen.before.size, seen.before.of_size),
             scale=self.lengths.scale.expand(len(seen.tilt)),

@@ -19,6 +19,7 @@ from torchpose.upper_body._estimator import Bones, Estimates, SeenPoses
 
 _NECK = UPPER_BODY.index("neck")
 _STD = 0.03  # metres: of every joint in space
+_NOISE = 0.02  # metres: of that, the noise of keypoints
 # Factors on the covariances of arms that are seen whole, and of those of which the hand is seen alone, at
 # full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
 # Other covariances hold as they are, with detectors' errors too.
@@ -34,6 +35,7 @@ class SeenBody(NamedTuple):
         shoulders: whether these are measured, [B, 2]. limbs: whether elbow and hand of both arms are,
             [B, 2, 2]. whole: whether both of any arm are.
         exact: whether every keypoint has full confidence, [B].
+        std: the standard deviation of a pixel over the focal length, 0 where no joint is measured, [B, 8].
         lengths: the lengths of the bones, metres, [B, 4]. bones: the same as they are reported, with
             their covariances.
         scale: the standard deviation of the log of their common scale, [B].
@@ -47,6 +49,7 @@ class SeenBody(NamedTuple):
     limbs: Tensor
     whole: bool
     exact: Tensor
+    std: Tensor
     lengths: Tensor
     bones: Bones
     scale: Tensor
@@ -190,16 +193,19 @@ def _trust(
 def _covs(
     body: SeenBody, joints: Float[Tensor, "B 8 3"], spread: Float[Tensor, "B 4 3 3"]
 ) -> tuple[Float[Tensor, "B 8 3 3"], Float[Tensor, "B 4 3 3"]]:
-    """Return the covariances of joints by stiffness of the torso and common scale, and all those of `LIMBS`.
+    """Return the covariances of joints by stiffness, noise and common scale, and all those of `LIMBS`.
 
-    Limbs have the spread of the posterior too.
+    Limbs have the spread of the posterior too, in which every hypothesis is on the rays of the keypoints.
 
     Args:
         body: the body but for its arms. joints: all of its joints. spread: that of the limbs.
     """
     apart = joints - joints[:, _NECK, None]
     outer = apart[..., :, None] * apart[..., None, :]
-    still = _STD**2 * torch.eye(3, dtype=joints.dtype, device=joints.device)
+    noise = ((body.std * joints[..., 2]).square() - _NOISE**2).clamp_min(0.0)
+    still = (_STD**2 + noise)[..., None, None] * torch.eye(
+        3, dtype=joints.dtype, device=joints.device
+    )
     covs = still + body.scale.square()[:, None, None, None] * outer
     rows = index_tensor(LIMBS, joints.device)
     limbs = covs.index_select(1, rows) + spread + body.others

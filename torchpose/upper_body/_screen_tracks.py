@@ -1,16 +1,17 @@
 """Follow the place of each joint in the image, and a candidate for it, through outliers."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.upper_body._noise_level import NoiseLevel
 from torchpose.upper_body._screen_model import CERTAIN, TAKEOVER, ScreenModel
 
-TRACKS = ("position", "velocity", "cov", "evidence")
-"""Fields of `ScreenState` that hold a track and a candidate of each joint."""
+# Fields of `ScreenState` that hold a track and a candidate of each joint.
+_TRACKS = ("position", "velocity", "cov", "evidence")
 
 DOUBTFUL = 3.0
 """Log-odds phi below whose negative a place does not go with the other joints."""
@@ -25,6 +26,7 @@ class ScreenState(NamedTuple):
         evidence: seconds for which each was seen, at most so many as count [B, 2, 8].
         exchange: log-probability of each way to exchange left and right [B, X]. lasting: seconds for
             which they have been exchanged [B]. scales: log-probability of the person's sizes [B, G].
+        level: how much noise there is.
     """
 
     position: Tensor
@@ -34,6 +36,7 @@ class ScreenState(NamedTuple):
     exchange: Tensor
     lasting: Tensor
     scales: Tensor
+    level: NoiseLevel
 
 
 def init_screen(model: ScreenModel, batch_size: int) -> ScreenState:
@@ -43,6 +46,7 @@ def init_screen(model: ScreenModel, batch_size: int) -> ScreenState:
     return ScreenState(
         middle.repeat(n, 2, 8, 1), like.new_zeros(n, 2, 8, 2), cov.repeat(n, 2, 8, 1),
         like.new_zeros(n, 2, 8), not_exchanged(model, n), like.new_zeros(n), model.usual.repeat(n, 1),
+        NoiseLevel.usual(n, model.dt, like),
     )  # fmt: skip
 
 
@@ -87,8 +91,7 @@ def take_over(
     state = state._replace(evidence=torch.stack([of_track, of_candidate], 1))
     if bool(taken.any()):
         order = torch.stack([taken, ~taken], 1).long()
-        tracks = {name: in_order(getattr(state, name), order, 1) for name in TRACKS}
-        state = state._replace(**tracks)
+        state = tracks_in_order(state, order, 1)
         track, candidate = in_order(torch.stack([track, candidate], 1), order, 1).unbind(1)
         total = track + body
     return state, torch.stack([total, candidate], 1)
@@ -126,12 +129,18 @@ def start_candidates(
         "cov": torch.stack([noise, torch.zeros_like(noise), square * model.speed], -1),
         "evidence": torch.full_like(noise, model.dt),
     }  # fmt: skip
-    changed = {}
+    changed: dict[str, Any] = {}
     for name, value in started.items():
         track, candidate = getattr(state, name).unbind(1)
         at = new.reshape(*new.shape, *[1] * (value.ndim - 2))
         changed[name] = torch.stack([track, torch.where(at, value, candidate)], 1)
     return state._replace(**changed)
+
+
+def tracks_in_order(state: ScreenState, order: Int[Tensor, "B #N 8"], dim: int) -> ScreenState:
+    """Return the state with its tracks permuted; see `in_order`."""
+    tracks: dict[str, Any] = {name: in_order(getattr(state, name), order, dim) for name in _TRACKS}
+    return state._replace(**tracks)
 
 
 def in_order(value: Tensor, order: Int[Tensor, "B #N 8"], dim: int) -> Tensor:

@@ -2,7 +2,8 @@
 
 Every joint is followed by a small filter of its own, which asks of a measured pixel whether the joint can
 have moved there and whether a body can have it there beside its other joints. What is improbable is
-taken as missing, before any estimator sees it.
+taken as missing, before any estimator sees it. Where torsos shake more than R says, R is enlarged
+(`follow_noise`).
 """
 
 import math
@@ -15,6 +16,7 @@ from torch.nn.functional import linear
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._measured_joints import MeasuredJoints
+from torchpose.upper_body._noise_level import follow_noise
 from torchpose.upper_body._screen_model import (
     APART,
     OUTLIERS,
@@ -24,7 +26,6 @@ from torchpose.upper_body._screen_model import (
 )
 from torchpose.upper_body._screen_tracks import (
     DOUBTFUL,
-    TRACKS,
     ScreenState,
     in_order,
     init_screen,
@@ -32,6 +33,7 @@ from torchpose.upper_body._screen_tracks import (
     predict_tracks,
     start_candidates,
     take_over,
+    tracks_in_order,
     update_tracks,
 )
 
@@ -96,7 +98,8 @@ def advance_screen(
             prior's pixels.
     """
     with torch.no_grad():
-        state, probability, way = _run(model, state, measured)
+        state, probability, way, factor = _run(model, state, measured)
+    measured = _noisier(measured, factor)
     exchanged = way > 0
     joints = model.exchanges[way] if bool(exchanged.any()) else None
     given = measured.mask if joints is None else measured.mask.gather(2, joints)
@@ -106,20 +109,27 @@ def advance_screen(
 
 def _run(
     model: ScreenModel, state: ScreenState, measured: MeasuredJoints
-) -> tuple[ScreenState, Float[Tensor, "B T 8"], Int[Tensor, "B T"]]:
-    """Return the next state, and of each frame the inlier probabilities and the way of exchange."""
+) -> tuple[ScreenState, Float[Tensor, "B T 8"], Int[Tensor, "B T"], Float[Tensor, "B T"]]:
+    """Return the next state, and of each frame inlier probabilities, the way of exchange, and R's factor."""
     uv = measured.uv.to(model.low)
     known = measured.mask & ((uv >= model.low) & (uv <= model.high)).all(-1)
     noise = _largest_variance(measured.cov.to(model.low)).expand(known.shape)
     ways = model.exchanges
     frames = (uv[:, :, ways], known[:, :, ways], noise[:, :, ways], _doubt(measured)[:, :, ways])
-    probabilities, chosen = [], torch.zeros_like(known[..., 0], dtype=torch.long)
+    probabilities, factors, chosen = [], [], torch.zeros_like(known[..., 0], dtype=torch.long)
     for t in range(uv.shape[1]):
-        state, probability, way = _step(model, state, *(x[:, t] for x in frames))
+        z, there, variance, doubt = (x[:, t] for x in frames)
+        level, scale = state.level, _scale(model, state)
+        factors.append(level.factor)
+        variance = factors[-1][:, None, None] * variance
+        state, probability, way = _step(model, state, z, there, variance, doubt)
+        kept = known[:, t] & (probability >= 0.5)
+        level = follow_noise(level, uv[:, t], kept, noise[:, t], scale, model.dt)
+        state = state._replace(level=level)
         probabilities.append(probability)
         if way is not None:
             chosen[:, t] = way
-    return state, torch.stack(probabilities, 1), chosen
+    return state, torch.stack(probabilities, 1), chosen, torch.stack(factors, 1)
 
 
 def _step(
@@ -131,7 +141,7 @@ def _step(
     doubt: Float[Tensor, "B X 8"],
 ) -> tuple[ScreenState, Float[Tensor, "B 8"], Int[Tensor, " B"] | None]:
     """Return the next state, the inlier probabilities of a frame, and the way of exchange; None is 0."""
-    scale = model.scale * (state.scales.exp() @ model.log_scales).exp()
+    scale = _scale(model, state)
     square = scale.square()[:, None, None]
     state = predict_tracks(model, state, square)
     noise, jump = noise + SLACK**2 * square, square * model.jump
@@ -152,6 +162,11 @@ def _step(
     if bool(new.any()):
         state = start_candidates(model, state, z, noise, square[:, 0], new)
     return state, probability[:, 0], way
+
+
+def _scale(model: ScreenModel, state: ScreenState) -> Float[Tensor, " B"]:
+    """Return the expected scale of each person, pixels for each metre."""
+    return model.scale * (state.scales.exp() @ model.log_scales).exp()
 
 
 def _log_odds(
@@ -205,8 +220,7 @@ def _exchange(
         return state, odds, way
     order = ways[torch.where(turned, way, 0)][:, None]
     none = not_exchanged(model, len(track))
-    state = state._replace(
-        **{name: in_order(getattr(state, name), order, 2) for name in TRACKS},
+    state = tracks_in_order(state, order, 2)._replace(
         exchange=torch.where(turned[:, None], none, log_weights),
         lasting=torch.where(turned, 0.0, lasting),
     )
@@ -268,6 +282,19 @@ def _largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch
     """Return the larger eigenvalue of each covariance."""
     a, b, c, d = cov.flatten(-2).unbind(-1)
     return (a + d) / 2 + (((a - d) / 2).square() + b * c).clamp_min(0.0).sqrt()
+
+
+def _noisier(measured: MeasuredJoints, factor: Float[Tensor, "B T"]) -> MeasuredJoints:
+    """Return measurements with R times its factor, and so less sure; the same value if it is 1 everywhere."""
+    if bool((factor == 1).all()):
+        return measured
+    factor = factor.to(measured.cov)[..., None]
+    of_joints = factor[..., None, None]
+    middle, sure = measured.middle, measured.confidence
+    if middle is not None:
+        middle = middle._replace(cov=of_joints[..., 0] * middle.cov)
+    sure = torch.ones_like(measured.uv[..., 0]) if sure is None else sure
+    return measured._replace(cov=of_joints * measured.cov, middle=middle, confidence=sure / factor)
 
 
 def _screened(

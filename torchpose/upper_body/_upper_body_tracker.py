@@ -116,7 +116,8 @@ class UpperBodyTracker(WideModule):
             "articulated" where both shoulders and an elbow are measured, and "mkf-fixed". The attribute
             `method` is the default for few joints; `PoseTrack.method` is the method that ran.
         measurement_std: the standard deviation of a keypoint in pixels of the camera: one number, or one
-            for each of hand, elbow, shoulder, head and neck; by default as the prior learnt it, else 3.
+            for each of hand, elbow, shoulder, head and neck; by default as the prior learnt it, else 3. Where
+            the torso shakes more than that, it is enlarged, unless `outliers` is False.
         fps: the frame rate of the keypoints, by which the process noise is scaled; by default that of
             the prior.
         smoothing: the number of later frames that an estimate may use, "full" for all of them, None for
