@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.module_state import index_tensor
+from torchpose._core.module_state import index_tensor, outside_inference
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 _TORSO = tuple(
@@ -19,6 +20,7 @@ _USUAL = 1.0  # seconds of three joints that R counts for
 _MEMORY = 5.0  # seconds
 _ACCELERATION = 4.0  # m/s^2: of a coordinate of a torso
 _FARTHEST = 9.0  # times the usual square, beyond which a joint jumps
+_LEAST = 1e-30  # 1 / pixels squared
 _LARGEST = 6.0  # log2 of the factor of the variance
 
 
@@ -26,16 +28,14 @@ class NoiseLevel(NamedTuple):
     """What second differences of the joints of a torso have said about the noise so far.
 
     Attributes:
-        before: the pixels of these joints in the last frame and in the one before, NaN where missing,
-            [B, 2, 4, 2]. noise: the variances of a coordinate of these, [B, 2, 4].
-        square: the discounted sum of their squares over what R makes of them, [B]. weight: that of their
-            weights, [B]. Both begin with what is usual.
+        before: the pixels of these joints and the variance of a coordinate in the last frame and in the one
+            before, NaN where missing, [B, 2, 4, 3].
+        sums: the discounted sums of their squares over what R makes of them, and of their weights, [B, 2].
+            Both begin with what is usual.
     """
 
     before: Tensor
-    noise: Tensor
-    square: Tensor
-    weight: Tensor
+    sums: Tensor
 
     @classmethod
     def usual(cls, batch_size: int, dt: float, like: Tensor) -> NoiseLevel:
@@ -44,14 +44,19 @@ class NoiseLevel(NamedTuple):
         Args:
             batch_size: B. dt: seconds between two frames. like: tells dtype and device.
         """
-        before = like.new_full((batch_size, 2, len(_TORSO), 2), torch.nan)
-        usual = like.new_full((batch_size,), 3 * _USUAL / dt)
-        return cls(before, torch.zeros_like(before[..., 0]), usual, usual)
+        before = like.new_full((batch_size, 2, len(_TORSO), 3), torch.nan)
+        return cls(before, like.new_full((batch_size, 2), 3 * _USUAL / dt))
+
+    @property
+    def square(self) -> Float[Tensor, " B"]:
+        """Return the factor of R that the noise has, whatever it is."""
+        square, weight = self.sums.unbind(1)
+        return square / weight
 
     @property
     def factor(self) -> Float[Tensor, " B"]:
         """Return the factor of R: 1 or a higher power of two, so that many frames have the same one."""
-        return (self.square / self.weight).log2().round().clamp(0.0, _LARGEST).exp2()
+        return self.square.log2().round().clamp(0.0, _LARGEST).exp2()
 
 
 def follow_noise(
@@ -77,21 +82,22 @@ def follow_noise(
             coordinates. scale: pixels for each metre. dt: seconds between two frames.
     """
     rows = index_tensor(_TORSO, uv.device)
-    place = uv[:, rows].masked_fill(~known[:, rows, None], torch.nan)
-    variance, (last, earlier), (of_last, of_earlier) = (
-        noise[:, rows], level.before.unbind(1), level.noise.unbind(1)
-    )  # fmt: skip
-    shaken = (place - 2 * last + earlier).square().mean(-1)
+    seen = torch.cat([uv, noise[..., None]], -1).index_select(1, rows)
+    seen = seen.masked_fill(~known.index_select(1, rows)[..., None], torch.nan)
+    last, earlier = level.before.unbind(1)
+    apart = torch.addcmul(seen + earlier, last, _middle_weights(uv.dtype, uv.device))
     moved = (_ACCELERATION * dt**2 * scale).square()[:, None]
-    ratio = shaken / (variance + 4 * of_last + of_earlier + moved)
-    there = ratio.isfinite()
-    lowest = variance.masked_fill(~there, math.inf).amin(1, keepdim=True)
-    weight = torch.where(there, lowest / variance, 0.0)
-    most = _FARTHEST * (level.square / level.weight)[:, None]
-    square = (weight * torch.where(there, ratio.minimum(most), 0.0)).sum(1)
+    ratio = apart[..., :2].square().mean(-1) / (apart[..., 2] + moved)
+    weight = seen[..., 2].reciprocal().where(ratio == ratio, 0.0)
+    weight = weight / weight.amax(1, keepdim=True).clamp_min(_LEAST)
+    square = weight * ratio.minimum(_FARTHEST * level.square[:, None]).nan_to_num(0.0)
     kept = math.exp(-dt / _MEMORY)
-    usual = (1 - kept) * 3 * _USUAL / dt
-    return NoiseLevel(
-        torch.stack([place, last], 1), torch.stack([variance, of_last], 1),
-        kept * level.square + usual + square, kept * level.weight + usual + weight.sum(1),
-    )  # fmt: skip
+    found = torch.stack([square, weight], 1).sum(-1) + (1 - kept) * 3 * _USUAL / dt
+    return NoiseLevel(torch.stack([seen, last], 1), torch.add(found, level.sums, alpha=kept))
+
+
+@cache
+def _middle_weights(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " 3"]:
+    """Return the weights of the last pixel and of its variance in a second difference and its variance."""
+    with outside_inference():
+        return torch.tensor([-2.0, -2.0, 4.0], dtype=dtype, device=device)

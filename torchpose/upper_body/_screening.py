@@ -122,7 +122,7 @@ def _run(
         level, scale = state.level, _scale(model, state)
         factors.append(level.factor)
         variance = factors[-1][:, None, None] * variance
-        state, probability, way = _step(model, state, z, there, variance, doubt)
+        state, probability, way = _step(model, state, scale, z, there, variance, doubt)
         kept = known[:, t] & (probability >= 0.5)
         level = follow_noise(level, uv[:, t], kept, noise[:, t], scale, model.dt)
         state = state._replace(level=level)
@@ -135,13 +135,13 @@ def _run(
 def _step(
     model: ScreenModel,
     state: ScreenState,
+    scale: Float[Tensor, " B"],
     uv: Float[Tensor, "B X 8 2"],
     known: Bool[Tensor, "B X 8"],
     noise: Float[Tensor, "B X 8"],
     doubt: Float[Tensor, "B X 8"],
 ) -> tuple[ScreenState, Float[Tensor, "B 8"], Int[Tensor, " B"] | None]:
     """Return the next state, the inlier probabilities of a frame, and the way of exchange; None is 0."""
-    scale = _scale(model, state)
     square = scale.square()[:, None, None]
     state = predict_tracks(model, state, square)
     noise, jump = noise + SLACK**2 * square, square * model.jump
