@@ -203,6 +203,7 @@ def _covs(
     apart = joints - joints[:, _NECK, None]
     outer = apart[..., :, None] * apart[..., None, :]
     noise = ((body.std * joints[..., 2]).square() - _NOISE**2).clamp_min(0.0)
+    noise[:, _NECK] = 0.0  # which may be put beside other joints, with a wide R
     still = (_STD**2 + noise)[..., None, None] * torch.eye(
         3, dtype=joints.dtype, device=joints.device
     )
