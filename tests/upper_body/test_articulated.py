@@ -617,3 +617,12 @@ def test_more_frames_a_second_are_no_worse():
         apart = (found - found[:, :2].mean(1, True)) - (joints - joints[:, :2].mean(1, True))
         off[fps] = float(torch.linalg.vector_norm(apart[:, 2:], dim=-1).mean())
     assert off[120.0] < 1.2 * off[30.0], off
+
+
+def test_smoothing_averages_the_noise_of_keypoints():
+    joints = body(30)
+    seen = pixels(joints, 4.0)[None]
+    filtered, smoothed = (tracker(smoothing=s)(seen).joints2d[0] for s in (None, "full"))
+    rows = [ROW[f"elbow_{side}"] for side in ("left", "right")]
+    off = [(found - pixels(joints))[:, rows].norm(dim=-1).mean() for found in (filtered, smoothed)]
+    assert float(off[1]) < 0.8 * float(off[0])

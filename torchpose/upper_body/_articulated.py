@@ -50,6 +50,7 @@ from torchpose.upper_body._estimator import (
 )
 from torchpose.upper_body._lean import lean_angle, roll, seen_lean
 from torchpose.upper_body._measured_joints import MeasuredJoints
+from torchpose.upper_body._nearby_frames import averaged_over_frames, frames_of_reach
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._root_grid import Moments, RootGrid
 from torchpose.upper_body._seen_size import SeenSize, follow_size
@@ -140,7 +141,8 @@ class ArticulatedFilter(Estimator):
        body that is far from a small one that is near, so the common scale stays the prior's.
     3. The arms: hypotheses at every angle to the image that a bone of known length may have, weighed by
        a density over directions and tied to those of the frame before (`ArmChain`), and with `smoothing`
-       to those of later frames, of which 40 kB each are kept.
+       to those of later frames, of which 40 kB each are kept. They lie on the rays of their frame, so with
+       `smoothing` keypoints are averaged over nearby frames first (`averaged_over_frames`).
 
     Args:
         model: the model of the tracker.
@@ -186,6 +188,7 @@ class ArticulatedFilter(Estimator):
             sources,
             lambda: DirectionDensity(self.prior, like.device),
         )
+        self.ahead = frames_of_reach(model.rate, model.smoothing)
         self.stride = max(1, round(_SHARE * model.rate))
         self.every = max(1, round(_UPDATE * model.rate))
         self.chain = ArmChain(density, model.rate)
@@ -255,10 +258,12 @@ class ArticulatedFilter(Estimator):
         smoothing = self.model.smoothing
         if smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
+        if self.ahead:
+            measured = averaged_over_frames(measured, lengths, self.ahead)
         state = self.init(len(measured.uv), joints, arm_generators)
         steps = self._steps(state, measured, progress)
         seen, arms = zip(*((step.seen, step.arms) for step in steps), strict=True)
-        lag = int(smoothing) if isinstance(smoothing, int) else None
+        lag = int(smoothing) - self.ahead if isinstance(smoothing, int) else None
         found = list(zip(seen, self.chain.smoothed(arms, lengths, lag), strict=True))
         parts = (found[i : i + _AT_ONCE] for i in range(0, len(found), _AT_ONCE))
         poses = [self._poses(part) for part in parts]

@@ -135,7 +135,8 @@ class MultipleModelFilter(Estimator):
 
         The log-odds are those of the frames before and of the later ones that smoothing uses. Windows with
         later frames in them are surer of persons whom they do not know, and not better. So their evidence is
-        that of the windows that end with the frame, and their poses are averaged with those of these.
+        that of the windows that end with the frame, and their poses are averaged with those of these. The
+        evidence of bones, too, is that of keypoints as they are measured.
         """
         if self.model.smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
@@ -146,7 +147,12 @@ class MultipleModelFilter(Estimator):
             told = self.causal.forward(measured, joints, arm_generators, lengths)
             half = torch.full_like(poses.place[..., 0], 0.5)
             poses = _averaged(half, poses, self._steadied(told, lengths))
-        ratios = _log_ratios(told, bodies, measured)
+        predicted = bodies
+        if self.articulated.ahead:
+            predicted = Estimator.forward(
+                self.articulated, measured, joints, arm_generators, lengths, progress
+            )
+        ratios = _log_ratios(told, predicted, measured)
         if lengths is not None:
             frames = torch.arange(ratios.shape[1], device=ratios.device)
             ratios = ratios * (frames < lengths.to(ratios.device)[:, None])[..., None]
