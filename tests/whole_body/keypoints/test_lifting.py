@@ -100,14 +100,14 @@ def test_a_saved_network_is_the_same_but_for_half_precision(tmp_path):
 def state_of(motion):
     """A filter, and its state of a body that stands at the joints of a moving one, with a wide covariance."""
     body, joints = motion.articulation, moving_body(1)
-    filter = KeypointTracker(ring(2), FPS, motion).filter
+    filter = KeypointTracker(ring(1), FPS, motion).filter
     point = _points(body, motion, filter.maps, joints, 1)
     point = body.swung(point, joints, torch.ones(1, 15, dtype=torch.bool))
     cov = 0.05**2 * torch.eye(body.dim, dtype=torch.float64)
     scales = body.columns["scales"]
     cov[scales, scales] *= 1e-6
     new = point.position.new_zeros
-    return filter, BodyGaussian(point, cov[None], new(1, 2, 2), new(1, 2), new(1, 15), new(1, 2))
+    return filter, BodyGaussian(point, cov[None], new(1, 1, 2), new(1, 1), new(1, 15), new(1, 1))
 
 
 def lifted_from(joints, std, off=(0.0, 0.0, 0.0)):

@@ -27,21 +27,21 @@ class BodyRoll(NamedTuple):
     """Holds how a body points in an image whose y points down.
 
     Attributes:
-        limbs: [B, 2, 2], mean unit directions from hips to shoulders and from ankles to hips; 0 where they
-            have not been seen. up: [B, 2], the unit direction that is taken to be the body's upwards.
+        limbs: [*batch, 2, 2], mean unit directions from hips to shoulders and from ankles to hips; 0 where
+            they have not been seen. up: [*batch, 2], the unit direction that is taken to be upwards.
     """
 
     limbs: Tensor
     up: Tensor
 
     @classmethod
-    def upright(cls, like: Float[Tensor, " B"]) -> Self:
+    def upright(cls, like: Float[Tensor, "*batch"]) -> Self:
         """Return what is taken of bodies before they are seen."""
         up = torch.tensor([0.0, -1.0]).to(like)
-        return cls(like.new_zeros(len(like), 2, 2), up.expand(len(like), 2))
+        return cls(like.new_zeros(*like.shape, 2, 2), up.expand(*like.shape, 2))
 
     @property
-    def turn(self) -> Float[Tensor, "B 3 3"]:
+    def turn(self) -> Float[Tensor, "*batch 3 3"]:
         """Return the rotation about the optical axis after which the bodies are upright."""
         return turn_upright(self.up)
 

@@ -19,7 +19,7 @@ class KeypointStream(NamedTuple):
         lost: [B], for how many frames in a row most keypoints have been of something else, or there were
             none, which counts half, or the person has waited for a start.
         alone: [B], which of several cameras alone the person is followed by, -1 if by all.
-        memory: of [B], of what lifts keypoints of one camera.
+        memory: of [B], of what lifts the keypoints of each camera.
         faults: of the cameras, as each person tells them.
         size: of [B], of the only camera, in which the filter does not tell it.
         spread: [B, J], metres, standard deviations of the network's joints in the last frame that it lifted.

@@ -16,7 +16,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     BodyKalmanFilter,
     CorrectedBody,
 )
-from torchpose.whole_body._keypoints.body_size import SizeBelief
+from torchpose.whole_body._keypoints.body_size import SizeBelief, outer
 from torchpose.whole_body._keypoints.body_smoothing import BodyMoments, smooth
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
@@ -41,8 +41,10 @@ from torchpose.whole_body._keypoints.known_person import of_one_camera, std_of_l
 from torchpose.whole_body._keypoints.lifted_pose import (
     LifterMemory,
     PoseLifter,
+    are_side_by_side,
     contradicts,
     corrected_by,
+    telling,
 )
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.lone_camera import (
@@ -63,7 +65,7 @@ from torchpose.whole_body._keypoints.nested import (
     taken,
     write_part,
 )
-from torchpose.whole_body._keypoints.only_camera import OnlyCamera
+from torchpose.whole_body._keypoints.only_camera import LASTING, OnlyCamera
 
 LEAST_JOINTS = 6  # that are measured where tracking begins
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
@@ -102,7 +104,7 @@ class KeypointTracker(nn.Module):
         self.lasting_std, self.lone = lasting_std, lone
         self.size_std = size_std
         self._rig = (rig,)  # a tuple, so that its tensors are held once
-        self.lifter = PoseLifter(rig, fps, motion, up) if len(rig) == 1 else None
+        self.lifter = PoseLifter(rig, fps, motion, up) if are_side_by_side(rig) else None
         self.filter = BodyKalmanFilter(motion, rig, fps, n_iterations, up)
         self.only = OnlyCamera(self.filter, camera_height, lasting_std) if size_std > 0 else None
 
@@ -157,7 +159,7 @@ class KeypointTracker(nn.Module):
         Returns:
             The next stream, the poses of the frame [B, ...], and what the correction gave.
         """
-        if self.lifter is not None:
+        if len(self._rig[0]) == 1:
             step = self._advanced(stream, frame, predicted, waited)
             return step if self.only is None else self.only.at_size(step)
         if not watch:
@@ -208,7 +210,7 @@ class KeypointTracker(nn.Module):
             )
         if lifted is not None:
             spread = torch.where(lifted.std.isfinite(), lifted.std, stream.spread)
-            seen = found.weighed.inlier[:, 0] > 0.5
+            seen = found.weighed.inlier.amax(1) > 0.5
             unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
             stream = stream._replace(spread=spread, unseen=unseen)
         stream = stream._replace(lost=self._lost(stream, frame, found.weighed))
@@ -222,7 +224,8 @@ class KeypointTracker(nn.Module):
         """Return the poses of a frame."""
         inlier = found.weighed.inlier
         return KeypointPoses(
-            found.joints, self._unsure(found.joint_cov, found.joints, stream.alone),
+            found.joints,
+            self._unsure(found.joint_cov, found.joints, stream.alone, stream.spread),
             found.state.mean, found.state.cov, inlier, found.weighed.exchanged, found.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, started, stream.alone,
             stream.faults.turn, stream.faults.off, found.state.scale, found.joint_cov,
@@ -335,10 +338,16 @@ class KeypointTracker(nn.Module):
             gone = ~(seen.inlier > 0).flatten(1).any(-1) & there.any(-1)
             lost = torch.where(gone, before.lost + 1, lost)
         stream = stream._replace(
-            state=state, begun=after.begun, lost=lost, alone=alone, memory=after.memory
+            state=state,
+            begun=after.begun,
+            lost=lost,
+            alone=alone,
+            memory=mapped(
+                lambda every, one: into_all(every, one, camera), stream.memory, after.memory
+            ),
         )
         pose = one._replace(
-            covariance=self._unsure(by_one.joint_cov, by_one.joints, alone),
+            covariance=self._unsure(by_one.joint_cov, by_one.joints, alone, after.spread),
             inlier=into_all(torch.zeros_like(pose.inlier), one.inlier, camera),
             exchanged=into_all(pose.exchanged, one.exchanged, camera),
             alone=alone,
@@ -352,7 +361,8 @@ class KeypointTracker(nn.Module):
     def _own(self, stream: KeypointStream, camera: int) -> KeypointStream:
         """Return a stream as one camera has it for which there is no other."""
         state, alone = state_of(stream.state, camera), torch.full_like(stream.alone, NOBODY)
-        return stream._replace(state=state, alone=alone)
+        memory = mapped(lambda every: every[:, [camera]], stream.memory)
+        return stream._replace(state=state, alone=alone, memory=memory)
 
     def _lone_tracker(self, camera: int) -> "KeypointTracker":
         """Return what tracks by one of the cameras alone; it is set up when it is needed first."""
@@ -383,10 +393,10 @@ class KeypointTracker(nn.Module):
     def _lifted(
         self, stream: KeypointStream | None, frame: KeypointFrame
     ) -> tuple[LifterMemory, Lifted | None]:
-        """Return what the lifter remembers, and what it lifts in a frame of one camera."""
+        """Return what the lifter remembers, and what it lifts in a frame."""
         before = None if stream is None else stream.memory
         if self.lifter is None:
-            return before or LifterMemory.none(frame.inlier[:, 0, 0]), None
+            return before or LifterMemory.none(frame.inlier[..., 0]), None
         lifted, memory = self.lifter(frame, before)
         return memory, lifted
 
@@ -399,7 +409,7 @@ class KeypointTracker(nn.Module):
         rows = (nobody & (stream.lost > _LOST_TIME * self.filter.fps)).nonzero().squeeze(-1)
         if not len(rows):
             return stream.memory
-        none = LifterMemory.none(stream.lost[rows])
+        none = LifterMemory.none(frame.inlier[rows][..., 0])
         none = mapped(lambda new, own: new.to(own), none, stream.memory)
         return replaced(stream.memory, rows, none)
 
@@ -434,15 +444,35 @@ class KeypointTracker(nn.Module):
         joint_cov: Float[Tensor, "*batch J 3 3"],
         joints: Float[Tensor, "*batch J 3"],
         alone: Int[Tensor, "*batch"],
+        spread: Float[Tensor, "*batch J"],
     ) -> Float[Tensor, "*batch J 3 3"]:
         """Return covariances of joints with what frames do not average out, and one camera does not tell."""
         lasting = self.lasting_std**2 * torch.eye(3).to(joint_cov)
+        if len(self._rig[0]) > 1 and self.lifter is not None:
+            lasting = lasting + self._hardly_told(joints, spread)
         if not bool((alone >= 0).any()):
             return joint_cov + lasting
         std = std_of_legs(self.filter.motion)
         wider = of_any_size(joint_cov, joints, alone, self.filter.maps, std)
         lone = self.lone.lasting_std**2 * torch.eye(3).to(joint_cov)
         return wider + torch.where((alone >= 0)[..., None, None, None], lone, lasting)
+
+    def _hardly_told(
+        self, joints: Float[Tensor, "*batch J 3"], spread: Float[Tensor, "*batch J"]
+    ) -> Float[Tensor, "*batch J 3 3"]:
+        """Return what one camera would not tell, as far as cameras side by side do not.
+
+        With the mean c of their places, k of `telling` and the ray r_j from c to a joint p_j, it is
+
+            (s^2 (p_j - c) (p_j - c)^T + (1.25 s_j)^2 r_j r_j^T + s_l^2 I) / k^2.
+        """
+        maps = self.filter.maps
+        away = joints - maps.centre.mean(0)
+        size = std_of_legs(self.filter.motion) ** 2 * outer(away)
+        rays = torch.nn.functional.normalize(away, dim=-1)
+        depth = (LASTING * spread).square()[..., None, None] * outer(rays)
+        lone = self.lone.lasting_std**2 * torch.eye(3).to(joints)
+        return (size + depth + lone) / telling(maps, joints)[..., None, None, None].square()
 
     def _lost(
         self, stream: KeypointStream, frame: KeypointFrame, weighed: Weighed
@@ -483,7 +513,7 @@ class KeypointTracker(nn.Module):
         joint_cov = covariances_of(jacobian, cov)
         poses = poses._replace(
             joints=joints,
-            covariance=self._unsure(joint_cov, joints, poses.alone),
+            covariance=self._unsure(joint_cov, joints, poses.alone, poses.spread),
             point=point,
             state_cov=cov,
             joint_cov=joint_cov,

@@ -32,7 +32,7 @@ def with_body(motion: BodyMotion, body: Body) -> BodyMotion:
 def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     """Return the prior of a person whose height is known, which tells the scale of the legs."""
     body = motion.articulation
-    told = _of_legs(motion)
+    told = weights_of_legs(motion)
     wanted = body.scales_of(BODY_15.standard_lengths(height).to(motion.scale_mean)) @ told
     cross = motion.scale_cov @ told
     gain = cross / (told @ cross + _HEIGHT_STD**2)
@@ -47,7 +47,7 @@ def of_one_camera(motion: BodyMotion) -> BodyMotion:
     The legs together keep the length that is expected. Proportions have the covariance over persons whose
     legs are equally long.
     """
-    told = _of_legs(motion)
+    told = weights_of_legs(motion)
     cross = motion.scale_cov @ told
     cov = motion.scale_cov - cross[:, None] * cross / (told @ cross)
     cov = cov + _LENGTH_STD**2 * torch.eye(len(cov)).to(cov)
@@ -64,11 +64,11 @@ def length_of_legs(motion: BodyMotion) -> float:
 
 def std_of_legs(motion: BodyMotion) -> float:
     """Return the standard deviation of the log of the legs' length."""
-    told = _of_legs(motion)
+    told = weights_of_legs(motion)
     return float((told @ motion.scale_cov @ told).clamp_min(0).sqrt())
 
 
-def _of_legs(motion: BodyMotion) -> Tensor:
+def weights_of_legs(motion: BodyMotion) -> Tensor:
     """Return the weights of the logarithms of lengths whose sum is that of the legs."""
     legs = [name in _LEGS for name in motion.articulation.groups]
     told = torch.tensor(legs).to(motion.scale_mean)

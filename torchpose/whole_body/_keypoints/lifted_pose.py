@@ -1,4 +1,4 @@
-"""Lift the keypoints of one camera to a pose, which the filter takes for another measurement of the frame.
+"""Lift the keypoints of a camera to a pose, which the filter takes for another measurement of the frame.
 
 One camera does not see the depth of limbs. A network that has seen many poses tells the joints l_j that go
 with the keypoints, and their standard deviations s_j. It has seen people who are upright, so keypoints of
@@ -9,9 +9,18 @@ others are turned about the optical axis first (`body_roll`). The filter is corr
 before it is corrected by the keypoints themselves, so that these find limbs that point the right way. Where
 the filter expects another pose altogether, as after frames with exchanged sides, tracking begins anew with
 the lifted one.
+
+Cameras side by side hardly see depth either, and a body fitted to noise along the rays has bones that grow.
+So the mean of what is lifted from each of them counts, the less the larger the angle a between their rays is:
+with k = 1 + (a / a_0)^2 its deviations are k s_j. The angle tells the size of the person as well, so
+
+    e^((1/k - 1) s(x)) (p_j(x) - p_pelvis(x)) = l_j + e_j,
+
+where s(x) is the log of the legs' length against that which is expected. At a = 0 this is one camera.
 """
 
 import copy
+import math
 from typing import NamedTuple, Self
 
 import torch
@@ -19,19 +28,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.module_state import derived
+from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.known_person import length_of_legs
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.known_person import length_of_legs, weights_of_legs
 from torchpose.whole_body._keypoints.lifting_network import (
     MEMORY,
     Lifted,
     lifting_features,
     shipped_lifting_network,
 )
+from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import camera_up, upright_of
 
 _FACTOR = (
@@ -42,6 +53,8 @@ _CONTRADICTION = (
 )
 _ITERATIONS = 2
 _LEAST_JOINTS = 6  # keypoints without which a frame is not lifted
+_SIDE_BY_SIDE = 1.0  # metres between cameras, up to which their keypoints are lifted
+_TELLING = math.radians(7.0)  # a_0, chosen on the fitted persons of `benchmarks.keypoint_bodies`
 _PASSES, _CLOSE = 4, 0.1  # metres, from where on the error of a ray counts less
 _NEAREST = 0.5  # metres from the camera
 _LEAST_UP = 0.2  # share of the upward direction in the image plane, below which it tells no roll
@@ -50,20 +63,24 @@ _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
 
 
 class LifterMemory(NamedTuple):
-    """Holds what is known of persons from earlier frames: the network's state [B, L, W], how they point."""
+    """Holds what is known of persons from earlier frames, by each camera.
+
+    Attributes:
+        network: the state of the network, [B, C, L, W]. roll: how they point, of [B, C].
+    """
 
     network: Tensor
     roll: BodyRoll
 
     @classmethod
-    def none(cls, like: Float[Tensor, " B"]) -> Self:
+    def none(cls, like: Float[Tensor, "B C"]) -> Self:
         """Return the memory before the first frame."""
-        network = torch.zeros(len(like), *MEMORY, device=like.device)
+        network = torch.zeros(*like.shape, *MEMORY, device=like.device)
         return cls(network, BodyRoll.upright(like))
 
 
 class _UprightView(NamedTuple):
-    """Holds the map from homogeneous pixels to rays [3, 3], and the pose of a camera turned upright."""
+    """Holds maps from homogeneous pixels to rays [C, 3, 3], and the poses of cameras turned upright."""
 
     to_rays: Tensor
     rotation: Tensor
@@ -71,18 +88,18 @@ class _UprightView(NamedTuple):
 
     @classmethod
     def of(cls, rig: CameraRig, up: str | None) -> Self:
-        """Return the view of the only camera of a rig."""
+        """Return the views of the cameras of a rig."""
         upright = upright_of(rig, up) or camera_up(rig)
-        roll = _upright_roll(rig.rotation[0] @ upright.direction)
-        inverse = torch.linalg.inv(rig.matrix[0])
-        return cls(roll @ inverse, roll @ rig.rotation[0], roll @ rig.translation[0])
+        roll = torch.stack([_upright_roll(axes @ upright.direction) for axes in rig.rotation])
+        place = (roll @ rig.translation[..., None]).squeeze(-1)
+        return cls(roll @ torch.linalg.inv(rig.matrix), roll @ rig.rotation, place)
 
 
 class PoseLifter(nn.Module):
-    """Lifts the keypoints of one camera to joints of a person of known size.
+    """Lifts the keypoints of one camera, or of each of several, to joints of a person of known size.
 
     Args:
-        rig: of one camera. fps: frames per second. motion: of the person, whose legs tell the size.
+        rig: of cameras side by side. fps: frames per second. motion: of the person, whose legs tell the size.
         up: "y" or "z", the axis of the world that points up, by which the image is turned upright; without
             it the camera is taken to be level.
     """
@@ -108,7 +125,7 @@ class PoseLifter(nn.Module):
 
     @property
     def view(self) -> "_UprightView":
-        """Return the camera, turned upright."""
+        """Return the cameras, turned upright."""
         rig = self._given[0]
         sources = (rig.matrix, rig.rotation, rig.translation)
         return derived(self, "view", sources, lambda: _UprightView.of(rig, self.up))
@@ -118,39 +135,64 @@ class PoseLifter(nn.Module):
     ) -> tuple[Lifted, LifterMemory]:
         """Return joints relative to the pelvis in world axes, and what is known after the frame.
 
+        They are the mean over the cameras that see enough joints.
+
         Args:
             frame: of keypoints. memory: of the frame before; None at the beginning.
         """
-        sure = frame.inlier[:, 0]
-        memory = LifterMemory.none(sure[:, 0]) if memory is None else memory
-        rays = self._rays(frame)
+        sure, rays = frame.inlier, self._rays(frame)
+        memory = LifterMemory.none(sure[..., 0]) if memory is None else memory
+        flat = mapped(lambda value: value.flatten(0, 1), (rays, sure, memory))
+        each = mapped(lambda value: value.unflatten(0, sure.shape[:2]), self._by_camera(*flat))
+        (joints, std), memory = each
+        enough = ((sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS).to(rays)
+        share = enough / enough.sum(1, keepdim=True).clamp_min(1)
+        mean = (share[..., None] * (joints @ self.view.rotation)).sum(1)
+        std = torch.where(share.sum(1) > 0, (share * std).sum(1), torch.inf)
+        return Lifted(mean, std), memory
+
+    def _by_camera(
+        self, rays: Float[Tensor, "N J 3"], sure: Float[Tensor, "N J"], memory: LifterMemory
+    ) -> tuple[Lifted, LifterMemory]:
+        """Return what is lifted from single cameras, in axes of the cameras turned upright."""
         roll, turned = next_roll(memory.roll, rays[..., :2], sure > 0, self.fps)
         seen = lifting_features((rays @ roll.turn.mT)[..., :2], sure, self.fps)
         before = memory.network.masked_fill(turned[:, None, None], 0.0)
         seen, before = (value.to(self.network.places.weight) for value in (seen, before))
         lifted, after = self.network(seen[:, None], before)
         joints, std = (self.size * value[:, 0].to(rays) for value in lifted)
-        enough = (sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS
-        lifted = Lifted(
-            joints @ roll.turn @ self.view.rotation, torch.where(enough, std, torch.inf)
-        )
-        return lifted, LifterMemory(after, roll)
+        return Lifted(joints @ roll.turn, std), LifterMemory(after, roll)
 
     def placed(self, lifted: Lifted, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
-        """Return lifted joints in the world, where they lie near the rays of their keypoints.
+        """Return lifted joints in the world, where they lie near the rays of the camera that sees most.
 
         Args:
             lifted: of `forward`. frame: the keypoints.
         """
-        view = self.view
-        joints = lifted.joints @ view.rotation.mT
-        place = place_on_rays(joints, self._rays(frame)[..., :2], frame.inlier[:, 0])
+        camera = (frame.inlier > 0).sum(-1).argmax(-1)
+        own = torch.arange(len(camera), device=camera.device), camera
+        rotation, translation = self.view.rotation[camera], self.view.translation[camera]
+        joints = lifted.joints @ rotation.mT
+        place = place_on_rays(joints, self._rays(frame)[own][..., :2], frame.inlier[own])
         place = torch.cat([place[:, :2], place[:, 2:].clamp_min(_NEAREST)], -1)
-        return (joints + place[:, None] - view.translation) @ view.rotation
+        return (joints + place[:, None] - translation[:, None]) @ rotation
 
-    def _rays(self, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
-        pixels = frame.pixels[:, 0]
+    def _rays(self, frame: KeypointFrame) -> Float[Tensor, "B C J 3"]:
+        pixels = frame.pixels
         return torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) @ self.view.to_rays.mT
+
+
+def are_side_by_side(rig: CameraRig) -> bool:
+    """Return whether all cameras are so near each other that their keypoints are lifted; one camera is."""
+    centres = -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
+    return float(torch.cdist(centres, centres).amax()) < _SIDE_BY_SIDE
+
+
+def telling(maps: RigMaps, joints: Float[Tensor, "*batch J 3"]) -> Float[Tensor, "*batch"]:
+    """Return k = 1 + (a / a_0)^2 with the largest angle a between the rays of cameras to the pelvis."""
+    rays = torch.nn.functional.normalize(joints[..., [_PELVIS], :] - maps.centre, dim=-1)
+    chord = torch.cdist(rays, rays, compute_mode="donot_use_mm_for_euclid_dist").amax((-2, -1))
+    return 1 + (chord / _TELLING).square()
 
 
 def _upright_roll(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -197,7 +239,8 @@ def contradicts(
     """
     joints = filter.articulation.joints(state.mean)
     apart = lifted.joints - (joints - joints[..., [_PELVIS], :])
-    off = (apart / (_FACTOR * lifted.std[..., None]))[..., _OTHERS, :]
+    k = telling(filter.maps, joints)[..., None, None]
+    off = (apart / (_FACTOR * k * lifted.std[..., None]))[..., _OTHERS, :]
     return off.square().mean((-2, -1)) > _CONTRADICTION
 
 
@@ -209,7 +252,8 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
         filter: whose states they are. state: [B].
     """
     body, mean, cov = filter.articulation, state.mean, state.cov
-    scale = (1 / (_FACTOR * lifted.std[..., _OTHERS, None])).expand(
+    k = telling(filter.maps, body.joints(mean))[..., None]
+    scale = (1 / (_FACTOR * k[..., None] * lifted.std[..., _OTHERS, None])).expand(
         *lifted.joints[..., _OTHERS, :].shape
     )
     scale = scale.flatten(-2)
@@ -218,8 +262,9 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
         joints, jacobian = body.linearise(point)
         apart = (joints - joints[..., [_PELVIS], :])[..., _OTHERS, :]
         H = (jacobian - jacobian[..., [_PELVIS], :, :])[..., _OTHERS, :, :].flatten(-3, -2)
+        apart, H = _of_expected_size(filter, point, apart.flatten(-2), H, 1 - 1 / k)
         H = scale[..., None] * H
-        off = scale * (lifted.joints[..., _OTHERS, :] - apart).flatten(-2)
+        off = scale * (lifted.joints[..., _OTHERS, :].flatten(-2) - apart)
         HP = H @ cov
         spread = HP @ H.mT
         chol = torch.linalg.cholesky((spread + spread.mT) / 2 + torch.eye(H.shape[-2]).to(H))
@@ -229,3 +274,22 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
     U = torch.linalg.solve_triangular(chol, HP, upper=False)
     cov = cov - U.mT @ U
     return state._replace(mean=point, cov=(cov + cov.mT) / 2)
+
+
+def _of_expected_size(
+    filter: BodyKalmanFilter,
+    point: BodyPoint,
+    apart: Float[Tensor, "B K"],
+    H: Float[Tensor, "B K N"],
+    share: Float[Tensor, "B 1"],
+) -> tuple[Float[Tensor, "B K"], Float[Tensor, "B K N"]]:
+    """Return joints from the pelvis, and their derivative, without a share of the log of the size."""
+    if len(filter.maps.shift) == 1:
+        return apart, H
+    motion = filter.motion
+    told = weights_of_legs(motion)
+    factor = (-share * ((point.scales - motion.scale_mean) @ told)[..., None]).exp()
+    apart, H = factor * apart, factor[..., None] * H
+    along = torch.zeros_like(H[..., 0, :])
+    along[..., filter.articulation.columns["scales"]] = told
+    return apart, H - (share * apart)[..., None] * along[..., None, :]

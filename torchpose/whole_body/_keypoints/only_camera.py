@@ -34,7 +34,7 @@ from torchpose.whole_body._keypoints.nested import by_parts, mapped
 
 # On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
 # strangers to a network that was fitted without them.
-_LASTING = 1.25
+LASTING = 1.25
 _LASTING_UNSEEN, _FORGOTTEN = 2.5, 0.5  # seconds
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
 _MIDDLE = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
@@ -120,7 +120,7 @@ class OnlyCamera:
     ) -> Float[Tensor, "*batch J 3 3"]:
         """Return the covariances of depths that the network does not tell, and `variances` each way."""
         rays = torch.nn.functional.normalize(poses.joints - self.centre, dim=-1)
-        depth = (_LASTING * poses.spread).square()[..., None, None] * outer(rays)
+        depth = (LASTING * poses.spread).square()[..., None, None] * outer(rays)
         return depth + variances[..., None, None] * torch.eye(3).to(rays)
 
 
