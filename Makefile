@@ -69,7 +69,8 @@ docs-serve: $(VENV)/.installed-dev
 install: $(VENV)/.installed-dev
 
 # The stamps are written last. An installation that was killed leaves .installing behind, with the id
-# of its process, and the next one starts with a new environment.
+# of its process, and the next one starts with a new environment. pip would compile one module after the
+# other, in one process; a few modules of other libraries are for other versions of Python.
 $(VENV)/.installed-%: pyproject.toml constraints.txt
 	@set -e; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -80,7 +81,8 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt
 	    $(PYTHON) -m venv --clear $(VENV); fi; \
 	echo $$$$ > $(VENV)/.installing; \
 	echo "installing torchpose[$*] into $(VENV)"; \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[$*]'; \
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true; \
 	touch $@; \
 	rm $(VENV)/.installing
 
