@@ -46,13 +46,15 @@ def test_none_and_typical(clean):
     values = [agreement(faulty(clean, severity), clean) for severity in (0.25, 0.5, 1.0, 2.0)]
     assert values == sorted(values, reverse=True)
     assert values[0] > 0.85 and 0.65 < values[2] < 0.9 and values[3] > 0.35
-    assert faulty(clean).shape == clean.shape and faulty(clean).dtype == torch.bool
 
 
 def test_the_seed_decides(clean):
-    assert torch.equal(faulty(clean, seed=3), faulty(clean, seed=3))
-    assert not torch.equal(faulty(clean, seed=3), faulty(clean, seed=4))
-    assert torch.equal(add_faults(clean), add_faults(clean))
+    few = clean[:4]
+    one = faulty(few, seed=3)
+    assert one.shape == few.shape and one.dtype == torch.bool
+    assert torch.equal(one, faulty(few, seed=3))
+    assert not torch.equal(one, faulty(few, seed=4))
+    assert torch.equal(add_faults(few), add_faults(few))
 
 
 def test_holes_lie_in_the_body_and_last(clean):
@@ -107,7 +109,7 @@ def test_noise_is_mostly_filtered_away(clean):
 
 
 def test_flicker_makes_some_frames_worse(clean):
-    long = clean[20:21].expand(200, -1, -1, -1)
+    long = clean[20:21, :1].expand(200, -1, -1, -1)
     kinds = ["holes", "edges", "flicker"]
     loss = (long ^ faulty(long, kinds=kinds)).double().mean((-2, -1)).mean(-1)
     calm = (long ^ faulty(long, kinds=kinds[:2])).double().mean((-2, -1)).mean(-1)

@@ -33,7 +33,7 @@ def shipped(files, tmp_path, monkeypatch):
 def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
-    done = torchpose("demo", "--out", out, "--seconds", 4, "--input", "keypoints")
+    done = torchpose("demo", "--out", out, "--seconds", 2, "--input", "keypoints")
     assert done.code == 0, done.err
     assert "smoke test on an animated performer" in done.out
     pictures = [line.strip() for line in done.out.splitlines()[-4:]]
@@ -47,13 +47,13 @@ def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
 
     clip, poses = read_keypoints(out / "keypoints.npz"), PoseTrack.load(out / "poses.npz")
     gap = ~clip.measured[:, clip.names.index("hand_right")]
-    assert int(gap.sum()) == 30 and len(clip) == 120
+    assert int(gap.sum()) == 18 and len(clip) == 60
     assert torch.equal(gap, ~poses.observed[0, :, UPPER_BODY.index("hand_right")])
     table = {row[:42].strip(): row[42:].split() for row in done.out.splitlines() if row[:1].strip()}
     filtered, smoothed, mean = (float(cell) for cell in table["all joints"])
     assert max(filtered, smoothed) < mean
     assert table["2D error, all joints (pixels)"][2] == "-"
-    assert "right hand while hidden (30 frames)" in table
+    assert "right hand while hidden (18 frames)" in table
 
     again = ("--out", tmp_path / "again", "--pictures", "false")
     tracked = torchpose("track", out / "keypoints.npz", *again)
@@ -121,8 +121,8 @@ def walked(tmp_path_factory):
     """The folder of a walk that was rendered and tracked, and what was printed."""
     out, printed = tmp_path_factory.mktemp("walk") / "walk", io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr(demo_walk, "_PARTICLES", 100)
-        search = partial(find_first_pose, n_particles=600, n_tracking=100)  # a third of the usual
+        patch.setattr(demo_walk, "_PARTICLES", 50)
+        search = partial(find_first_pose, n_particles=300, n_tracking=50)  # a sixth of the usual
         patch.setattr("torchpose.whole_body._particle_follower.find_first_pose", search)
         patch.delenv("TORCHPOSE_DATA", raising=False)
         options = ["--input", "walk", "--seconds", "1", "--pictures", "false"]

@@ -163,19 +163,24 @@ def test_methods(track, files, method):
 
 
 def test_options_reach_the_tracker(track, files):
-    same(track("--smoothing", "full")[1], expected(files, smoothing="full"))
-    same(track("--smoothing", 3)[1], expected(files, smoothing=3))
-    same(track("--frame", "body")[1], expected(files, frame="body"))
     stds = (5.0, 6.0, 6.0, 2.0, 3.0)
     text = ",".join(str(s) for s in stds)
-    same(track("--measurement-std", text)[1], expected(files, measurement_std=stds))
+    same(
+        track("--smoothing", "full", "--frame", "body", "--measurement-std", text)[1],
+        expected(files, smoothing="full", frame="body", measurement_std=stds),
+    )
+    same(track("--smoothing", 3)[1], expected(files, smoothing=3))
+    windows = load_prior(SMALL)  # others have nothing that is steady
+    same(
+        track("--prior", SMALL, "--steady", "false")[1],
+        expected(files, prior=windows, steady=False),
+    )
     given, lengths = "upper_arm=0.3,forearm=0.25", {"upper_arm": 0.3, "forearm": 0.25}
     same(
         track("--method", "articulated", "--bone-lengths", given)[1],
         expected(files, method="articulated", bone_lengths=lengths),
     )
     same(track("--height", 1.6)[1], expected(files, height=1.6))
-    same(track("--steady", "false")[1], expected(files, steady=False))
     same(track("--static-camera", "true")[1], expected(files, static_camera=True))
 
 
