@@ -119,7 +119,7 @@ def test_the_evidence_of_both_arms_is_the_sum_over_all_pairs(prior):
         1, 2, 1, n, 6
     )
     weight = torch.rand(1, 2, 1, n, generator=generator, dtype=DOUBLE)
-    arms = Arms(directions, weight.log(), prior.log_prob(directions), torch.zeros_like(weight))
+    arms = Arms(directions, weight.log(), prior.log_prob(directions))
     chain = ArmChain(DirectionDensity(prior), 30.0)
     parts = component_log_density(
         directions, mixture.means, torch.linalg.cholesky(mixture.covariances)

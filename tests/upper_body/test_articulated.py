@@ -17,7 +17,7 @@ from torchpose.priors._arms import LENGTHS, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body._arm_chain import Arms, _log_width
+from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_frame import LIMBS, SHOULDERS
 from torchpose.upper_body._articulated_poses import _trust
@@ -83,28 +83,6 @@ def test_a_waving_body_is_followed_in_space():
     for side in ("left", "right"):
         for bone, true in zip(bones(found, side), bones(joints, side), strict=True):
             assert float((bone[settled, 2] * true[settled, 2] > 0).double().mean()) > 0.9
-
-
-def test_hands_of_somebody_near_who_waves_are_not_drawn_to_the_camera():
-    """Hypotheses close to the camera move less for the same way in the image, but are not the likelier."""
-    joints, time = body(30, depth=0.8), torch.arange(30, dtype=torch.float64) / 30
-    raised = 0.5 + 0.5 * (6 * time).sin()
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        arm = torch.stack([sign * raised.sin(), raised.cos(), 0 * time], -1)
-        for joint, reach in (("elbow", 0.2686), ("hand", 0.5574)):
-            joints[:, ROW[f"{joint}_{side}"]] = joints[:, ROW[f"shoulder_{side}"]] + reach * arm
-    found = tracker()(pixels(joints, 2.0)[None]).joints3d[0, 10:]
-    hands, shoulders = ([ROW[f"{j}_{s}"] for s in ("left", "right")] for j in ("hand", "shoulder"))
-    assert float((found[:, hands, 2] - found[:, shoulders, 2]).mean()) > -0.19
-
-
-def test_steps_of_arms_depend_on_the_distance_near_the_camera_alone():
-    along = torch.tensor([[0.5, 0.8, 1.1], [2.3, 2.6, 2.9], [3.7, 4.0, 4.3]], dtype=torch.float64)
-    found = _log_width(along, along[:, 1:2])
-    near = math.log(0.5 / 0.8) - math.log((2.6 - 0.3) / 2.6)
-    assert float(found[0, 0]) == pytest.approx(near)
-    assert float(found[0, 1]) == pytest.approx(0.0, abs=1e-12)
-    assert float(found[1:].abs().max()) < 1e-12
 
 
 def test_bones_keep_their_lengths():
@@ -504,23 +482,17 @@ def test_smoothing_sums_over_all_later_paths():
     directions = torch.nn.functional.normalize(directions, dim=-1).flatten(-2)
     said = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
     prior = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
-    area = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
-    arms = [Arms(d[:, :, None], w.log()[:, :, None], (p / a).log()[:, :, None], a.log()[:, :, None])
-            for d, w, p, a in zip(directions, said, prior, area, strict=True)]  # fmt: skip
+    arms = [Arms(d[:, :, None], w.log()[:, :, None], p.log()[:, :, None])
+            for d, w, p in zip(directions, said, prior, strict=True)]  # fmt: skip
     hands = torch.tensor([[[1, 1]], [[1, 0]], [[0, 0]], [[1, 1]]]).bool()  # measured or not
     states = [chain.start(arms[0], hands[0])]
     for arm, seen in zip(arms[1:], hands[1:], strict=True):
         states.append(chain.update(states[-1], arm, seen))
 
-    def walk(t, step):
-        apart = directions[t - 1, :, :, :, None] - directions[t, :, :, None]
-        near = (area[t - 1, :, :, :, None] * area[t, :, :, None]) ** -0.25
-        squared = near * apart.square().sum(-1) / step**2
-        return 6 / (16 * math.pi**2 * step**4) * (1 + squared / 4) ** -4
-
     def moves(t):
+        pair = directions[t - 1 : t + 1].flatten(1, 2)
         seen, unseen = (
-            (1 - anew) * walk(t, step) + anew * prior[t, :, :, None]
+            (1 - anew) * chain._walk(*pair, step)[None] + anew * prior[t, :, :, None]
             for step, anew in (
                 (chain.step, chain.anew), (chain.step_unseen, chain.anew_unseen)
             )

@@ -27,8 +27,6 @@ _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose h
 _LATER = 0.25
 _RATE = 30.0
 _LEAST = 1e-30  # density
-_USUAL = 2.6  # metres: from there on steps of arms are as they were chosen
-_NEAREST = 0.1  # metres: joints are before the camera
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 # Arms of which all pairs of directions are compared at a time: intermediate results stay in the cache.
 _ARMS = 2
@@ -68,14 +66,11 @@ class Arms(NamedTuple):
         directions: the directions of upper arm and forearm, upright axes, [B, 2, M, N, 6].
         log_weight: the log of the likelihood times the node's share of the directions, [B, 2, M, N].
         log_prior: the log-density of the prior, [B, 2, M, N].
-        log_area: the log of the area of the measured ends' pixels, relative to what it is for somebody at the
-            usual distance or farther away (`_log_width`), [B, 2, M, N].
     """
 
     directions: Tensor
     log_weight: Tensor
     log_prior: Tensor
-    log_area: Tensor
 
     @property
     def log_evidence(self) -> Float[Tensor, "B 2 M"]:
@@ -96,9 +91,8 @@ class ArmState(NamedTuple):
         directions: the directions of the hypotheses, upright axes, [B, 2, N, 6].
         weight: their weights, normalised, [B, 2, N].
         log_evidence: the log-evidence of the frame given those before, [B, 2].
-        prior, predicted: the density of the prior times the area, and that predicted from the frames before,
-            at each hypothesis, [B, 2, N].
-        near: the factor by which a step of the arm counts as larger, since it is near the camera, [B, 2, N].
+        prior, predicted: the density of the prior, and that predicted from the frames before, at each
+            hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
     """
 
@@ -107,7 +101,6 @@ class ArmState(NamedTuple):
     log_evidence: Tensor
     prior: Tensor
     predicted: Tensor
-    near: Tensor
     seen: Tensor
 
 
@@ -118,10 +111,6 @@ class ArmChain:
     directions, or is reinitialised from the prior:
 
         p(x' | x) = (1 - e) t_4(x'; x, s^2) + e p(x')
-
-    What is nearer moves less in space for the same way in the image. Steps are therefore relative to the
-    distance from the camera: else hypotheses with hands close to a near camera were the likelier the more
-    an arm moves. From the usual distance on, where s and e were chosen, they are as they are.
 
     An arm whose hand is not measured moves less (s = 5 degrees, e = 0.02 at 30 frames a second, else 10 and
     0.2): what is not seen is best expected where it was. Above 30 frames a second steps are not smaller.
@@ -215,21 +204,14 @@ class ArmChain:
             weight = weight + of_elbow[..., None] + of_hand.view(weight.shape)
         weight = weight.flatten(-2)
         uppers = upper.directions.expand_as(start)
-        prior = self.density.of_arms(uppers, lower.axes, lower.turns)
-        area, away = torch.zeros_like(prior), torch.linalg.vector_norm(shoulder, dim=-1)[..., None]
-        if elbow:
-            area = area + 2 * _log_width(upper.along, away)[..., None]
-        if hand:
-            area = area + 2 * _log_width(lower.along, away[..., None])
-        prior, area = prior.flatten(-2), area.flatten(-2)
+        prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
         if weight.shape[-1] <= count:
             shape = *start.shape[:-1], sizes[1], 3
             bones = uppers[..., None, :], lower.directions
             directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
-            return Arms(directions, weight, prior, area)
+            return Arms(directions, weight, prior)
         best = (weight + prior).topk(count, -1, sorted=False).indices
-        chosen = (values.gather(-1, best) for values in (weight, prior, area))
-        return Arms(lower.chosen(uppers, best), *chosen)
+        return Arms(lower.chosen(uppers, best), weight.gather(-1, best), prior.gather(-1, best))
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -255,7 +237,7 @@ class ArmChain:
         Args:
             arms: the hypotheses. seen: whether the hands are measured.
         """
-        prior = _prior_in_view(arms)
+        prior = arms.log_prior[:, :, 0].exp()
         return _belief(arms, prior, prior, seen)
 
     def update(
@@ -270,11 +252,8 @@ class ArmChain:
         Args:
             again: whose arms start again, as if it were their first frame; None is nobody.
         """
-        prior = _prior_in_view(arms)
-        moved = self._moved(
-            state.weight, _steps(state.near, state.directions),
-            _steps(_near(arms), arms.directions[:, :, 0]), seen,
-        )  # fmt: skip
+        prior = arms.log_prior[:, :, 0].exp()
+        moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0], seen)
         predicted = moved + self._anew(seen, prior) * (prior - moved)
         if again is not None:
             predicted = torch.where(again[:, None, None], prior, predicted)
@@ -321,10 +300,7 @@ class ArmChain:
             after: the backward message at the next frame.
         """
         ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
-        moved = self._moved(
-            ratio, _steps(later.near, later.directions), _steps(state.near, state.directions),
-            later.seen,
-        )  # fmt: skip
+        moved = self._moved(ratio, later.directions, state.directions, later.seen)
         drawn = (later.prior * ratio).sum(-1, keepdim=True)
         message = moved + self._anew(later.seen, moved) * (drawn - moved)
         return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
@@ -333,10 +309,10 @@ class ArmChain:
         self,
         weight: Float[Tensor, "B 2 N"],
         before: Tensor,
-        after: Float[Tensor, "B 2 M 7"],
+        after: Float[Tensor, "B 2 M 6"],
         seen: Bool[Tensor, "B 2"],
     ) -> Float[Tensor, "B 2 M"]:
-        """Return sum_n w_n t_4(x'_m; x_n, s^2) for the directions x of two frames (`_steps`)."""
+        """Return sum_n w_n t_4(x'_m; x_n, s^2) for the directions x of two frames."""
         if bool(seen.all()):
             return self._walked(weight, before, after, self.step)
         unseen = self._walked(weight, before, after, self.step_unseen)
@@ -357,16 +333,15 @@ class ArmChain:
 
     @staticmethod
     def _walk(
-        before: Float[Tensor, "A N 7"], after: Float[Tensor, "A M 7"], step: float
+        before: Float[Tensor, "A N 6"], after: Float[Tensor, "A M 6"], step: float
     ) -> Float[Tensor, "A N M"]:
-        """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames (`_steps`)."""
+        """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
         scale = step**2
         most = 6 / (16 * math.pi**2 * scale**2)
         unit = most**-0.25
-        same = before.new_full((1, 1, 1), unit)
-        # two pairs of unit vectors: n n' |x - x'|^2 / 2 = 2 n n' - (n x) . (n' x')
-        alike = torch.cat([-before[..., :1], before[..., 1:]], -1)
-        far = torch.baddbmm(same, alike, after.mT, alpha=-unit / (2 * scale))
+        # of two pairs of unit vectors the product is 2 where they agree, and less elsewhere: far >= unit
+        same = before.new_full((1, 1, 1), unit * (1 + 1 / scale))
+        far = torch.baddbmm(same, before, after.mT, alpha=-unit / (2 * scale))
         # in place: memory for as many numbers again takes longer than the arithmetic
         return far.square_().pow_(-2)
 
@@ -384,46 +359,7 @@ def _belief(
     log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(_LEAST).log()
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
-    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, _near(arms), seen)
-
-
-def _log_width(
-    along: Float[Tensor, "*batch G"], away: Float[Tensor, "*#batch 1"]
-) -> Float[Tensor, "*batch G"]:
-    """Return the log of the width of a pixel at a joint relative to that at its shoulder, as it changes near.
-
-    With the distances r of the joint and z of the shoulder it is log r / z, less what that is where the
-    shoulder is at the usual distance or farther away, u = max(z, 2.6 m):
-
-        log (r / z) - log ((u + r - z) / u)
-
-    Args:
-        along: r, metres. away: z, metres.
-    """
-    usual = away.clamp_min(_USUAL)
-    along = along.clamp_min(_NEAREST)
-    return (along / away).log() - torch.log1p((along - away) / usual)
-
-
-def _prior_in_view(arms: Arms) -> Float[Tensor, "B 2 N"]:
-    """Return the density of the prior times the area, given one hypothesis of the root."""
-    return (arms.log_prior + arms.log_area)[:, :, 0].exp()
-
-
-def _near(arms: Arms) -> Float[Tensor, "B 2 N"]:
-    """Return the inverse of the mean width of elbow's and hand's pixels, given one hypothesis of the root."""
-    return (arms.log_area[:, :, 0] / -4).exp()
-
-
-def _steps(
-    near: Float[Tensor, "B 2 N"], directions: Float[Tensor, "B 2 N 6"]
-) -> Float[Tensor, "B 2 N 7"]:
-    """Return directions as rows (sqrt(2) n, n x), of which n n' |x - x'|^2 / 2 is a product of two.
-
-    Args:
-        near: n. directions: x, two unit vectors each.
-    """
-    return torch.cat([math.sqrt(2) * near[..., None], near[..., None] * directions], -1)
+    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen)
 
 
 def _axes_of_spheres(axes: Float[Tensor, "B M 3 3"]) -> Float[Tensor, "B 2 M 3 3"]:

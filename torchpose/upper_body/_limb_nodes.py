@@ -44,14 +44,6 @@ class LimbNodes:
         """Return the far ends of the limb."""
         return self.start[..., None, :] + self.length[..., None, None] * self.directions
 
-    @property
-    def along(self) -> Float[Tensor, "*batch G"]:
-        """Return the distances of the far ends from the camera, along the ray that they are on."""
-        ray = self.axes[..., 0, :]
-        return torch.addcmul(
-            (self.start * ray).sum(-1, keepdim=True), self.length[..., None], self.turns[:, 0]
-        )
-
     def chosen(
         self, near: Float[Tensor, "*batch G0 3"], rows: Int[Tensor, "*batch N"]
     ) -> Float[Tensor, "*batch N 6"]:
