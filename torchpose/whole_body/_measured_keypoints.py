@@ -13,9 +13,9 @@ from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._following import Observed
+from torchpose.whole_body._keypoints.begin_anew import LEAST_JOINTS
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS
 from torchpose.whole_body._keypoints.particle_likelihood import KeypointMeasurement
 
 

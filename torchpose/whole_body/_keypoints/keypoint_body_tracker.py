@@ -26,6 +26,7 @@ from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._foot_prior import shipped_foot_prior
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._body_track import BodyTrack, repeat_last
+from torchpose.whole_body._keypoints.begin_anew import LEAST_JOINTS, first_frames
 from torchpose.whole_body._keypoints.camera_conventions import check_conventions
 from torchpose.whole_body._keypoints.camera_notes import notes_on_refined
 from torchpose.whole_body._keypoints.camera_refinement import (
@@ -50,7 +51,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_reader import KeypointReader
-from torchpose.whole_body._keypoints.keypoint_tracker import LEAST_JOINTS, KeypointTracker
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.known_person import (
     of_one_camera,
     std_of_legs,
@@ -251,7 +252,7 @@ class KeypointBodyTracker(nn.Module):
             raise NobodySeenError(
                 f"sequence {int((~seen).nonzero()[0])} has no keypoint in any camera and frame"
             )
-        begun = self.tracker.first_frames(frames).tolist()
+        begun = first_frames(frames, self.fps).tolist()
         n_frames = frames.pixels.shape[1]
         if n_frames in begun:
             where = "" if len(self.rig) == 1 else " in two cameras, nor in one for half a second"

@@ -1,17 +1,15 @@
-"""Follow a person whom one of several cameras sees by that camera, as if there were no other.
-
-A body that is larger and farther away by the same factor looks the same. With the deviation s of the log of
-persons' sizes and the place c of the camera, the covariance of a joint p gets s^2 (p - c) (p - c)^T.
-"""
+"""Follow a person whom one of several cameras sees by that camera, as if there were no other."""
 
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_poses import KeypointStep, KeypointStream
+from torchpose.whole_body._keypoints.nested import mapped
 
 NOBODY = -1
 """In place of the camera that alone sees a person, where there is none."""
@@ -38,34 +36,49 @@ def frame_of(frame: KeypointFrame, camera: int, widening: float) -> KeypointFram
     return one._replace(relative=widening * one.relative)
 
 
-def state_of(state: BodyGaussian, camera: int) -> BodyGaussian:
-    """Return Gaussians with what is believed of one camera."""
-    log_odds, scale, told = (
-        value[:, [camera]] for value in (state.log_odds, state.scale, state.told)
-    )
-    return state._replace(log_odds=log_odds, scale=scale, told=told)
+def stream_of(stream: KeypointStream, camera: int) -> KeypointStream:
+    """Return a stream as one camera has it for which there is no other."""
+    both = _by_cameras(stream.state), stream.memory
+    (log_odds, scale, told), memory = mapped(lambda every: every[:, [camera]], both)
+    state = stream.state._replace(log_odds=log_odds, scale=scale, told=told)
+    return stream._replace(state=state, alone=torch.full_like(stream.alone, NOBODY), memory=memory)
 
 
-def into_all(
-    every: Float[Tensor, "B C *N"], one: Float[Tensor, "B 1 *N"], camera: int
-) -> Float[Tensor, "B C *N"]:
-    """Return values of all cameras with those of one in their place."""
-    return every.index_copy(1, torch.tensor([camera], device=every.device), one)
-
-
-def of_any_size(
-    cov: Float[Tensor, "*batch J 3 3"],
-    joints: Float[Tensor, "*batch J 3"],
-    alone: Int[Tensor, "*batch"],
-    maps: RigMaps,
-    std: float,
-) -> Float[Tensor, "*batch J 3 3"]:
-    """Return covariances of joints that one camera sees with what it does not tell of their depth.
+def step_by_one(step: KeypointStep, by_one: KeypointStep, camera: int) -> KeypointStep:
+    """Return a frame by all cameras with what one camera by itself gave in its place.
 
     Args:
-        cov: metres squared. joints: metres. alone: the camera, -1 where there are several.
-        maps: the cameras. std: of the log of persons' sizes.
+        step: by all cameras. by_one: by that one. camera: its number.
     """
-    away = std * (joints - maps.centre[alone.clamp_min(0)].unsqueeze(-2))
-    wider = cov + away[..., None] * away[..., None, :]
-    return torch.where((alone >= 0)[..., None, None, None], wider, cov)
+
+    def into_all(every: Float[Tensor, "B C *N"], one: Float[Tensor, "B 1 *N"]) -> Tensor:
+        return every.index_copy(1, torch.tensor([camera], device=every.device), one)
+
+    stream, pose, found = step
+    after, one, found_by_one = by_one
+    log_odds, scale, told = mapped(
+        into_all, _by_cameras(found.state), _by_cameras(found_by_one.state)
+    )
+    state = found_by_one.state._replace(log_odds=log_odds, scale=scale, told=told)
+    alone = torch.full_like(stream.alone, camera)
+    stream = stream._replace(
+        state=state,
+        begun=after.begun,
+        lost=after.lost,
+        alone=alone,
+        memory=mapped(into_all, stream.memory, after.memory),
+    )
+    pose = one._replace(
+        inlier=into_all(torch.zeros_like(pose.inlier), one.inlier),
+        exchanged=into_all(pose.exchanged, one.exchanged),
+        alone=alone,
+        turn=pose.turn,
+        off=pose.off,
+        scale=scale,
+    )
+    return stream, pose, found_by_one._replace(state=state, weighed=found.weighed)
+
+
+def _by_cameras(state: BodyGaussian) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what is believed of each camera."""
+    return state.log_odds, state.scale, state.told

@@ -34,7 +34,7 @@ from torchpose.whole_body._keypoints.nested import by_parts, mapped
 
 # On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
 # strangers to a network that was fitted without them.
-LASTING = 1.25
+_LASTING = 1.25
 _LASTING_UNSEEN, _FORGOTTEN = 2.5, 0.5  # seconds
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
 _MIDDLE = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
@@ -119,9 +119,20 @@ class OnlyCamera:
         self, poses: KeypointPoses, variances: Float[Tensor, "*batch J"]
     ) -> Float[Tensor, "*batch J 3 3"]:
         """Return the covariances of depths that the network does not tell, and `variances` each way."""
-        rays = torch.nn.functional.normalize(poses.joints - self.centre, dim=-1)
-        depth = (LASTING * poses.spread).square()[..., None, None] * outer(rays)
-        return depth + variances[..., None, None] * torch.eye(3).to(rays)
+        depths = untold_depths(poses.joints - self.centre, poses.spread)
+        return depths + variances[..., None, None] * torch.eye(3).to(depths)
+
+
+def untold_depths(
+    away: Float[Tensor, "*batch J 3"], spread: Float[Tensor, "*batch J"]
+) -> Float[Tensor, "*batch J 3 3"]:
+    """Return the covariances (1.25 s_j)^2 r_j r_j^T of joints in depths of which the network is unsure.
+
+    Args:
+        away: from the camera to the joints, metres. spread: s_j, metres.
+    """
+    rays = torch.nn.functional.normalize(away, dim=-1)
+    return (_LASTING * spread).square()[..., None, None] * outer(rays)
 
 
 def _guessed_in_room(poses: KeypointPoses) -> Float[Tensor, "*batch J"]:
