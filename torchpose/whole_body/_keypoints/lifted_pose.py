@@ -45,12 +45,9 @@ from torchpose.whole_body._keypoints.lifting_network import (
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import camera_up, upright_of
 
-_FACTOR = (
-    1.5  # on the network's standard deviations, which are those of persons that it was fitted to
-)
-_CONTRADICTION = (
-    1.0  # mean square of e_j / (1.5 s_j): usually it is 0.1, and in one frame of a hundred 1
-)
+# On the network's standard deviations, which are those of persons that it was fitted to.
+_FACTOR = 1.5
+_CONTRADICTION = 1.0  # mean square of e_j / (1.5 s_j): usually 0.1, and 1 in one frame of a hundred
 _ITERATIONS = 2
 _LEAST_JOINTS = 6  # keypoints without which a frame is not lifted
 _SIDE_BY_SIDE = 1.0  # metres between cameras, up to which their keypoints are lifted
@@ -253,10 +250,9 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
     """
     body, mean, cov = filter.articulation, state.mean, state.cov
     k = telling(filter.maps, body.joints(mean))[..., None]
-    scale = (1 / (_FACTOR * k[..., None] * lifted.std[..., _OTHERS, None])).expand(
-        *lifted.joints[..., _OTHERS, :].shape
-    )
-    scale = scale.flatten(-2)
+    wanted = lifted.joints[..., _OTHERS, :]
+    scale = 1 / (_FACTOR * k[..., None] * lifted.std[..., _OTHERS, None])
+    wanted, scale = wanted.flatten(-2), scale.expand_as(wanted).flatten(-2)
     point, d = mean, torch.zeros_like(cov[..., 0])
     for _ in range(_ITERATIONS):
         joints, jacobian = body.linearise(point)
@@ -264,12 +260,12 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
         H = (jacobian - jacobian[..., [_PELVIS], :, :])[..., _OTHERS, :, :].flatten(-3, -2)
         apart, H = _of_expected_size(filter, point, apart.flatten(-2), H, 1 - 1 / k)
         H = scale[..., None] * H
-        off = scale * (lifted.joints[..., _OTHERS, :].flatten(-2) - apart)
+        off = scale * (wanted - apart)
         HP = H @ cov
         spread = HP @ H.mT
         chol = torch.linalg.cholesky((spread + spread.mT) / 2 + torch.eye(H.shape[-2]).to(H))
-        wanted = off[..., None] + H @ d[..., None]
-        d = (HP.mT @ torch.cholesky_solve(wanted, chol)).squeeze(-1)
+        apart_from_mean = off[..., None] + H @ d[..., None]
+        d = (HP.mT @ torch.cholesky_solve(apart_from_mean, chol)).squeeze(-1)
         point = body.moved(mean, d)
     U = torch.linalg.solve_triangular(chol, HP, upper=False)
     cov = cov - U.mT @ U
