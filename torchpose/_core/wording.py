@@ -13,6 +13,15 @@ def first_of(names: Sequence[object], most: int, between: str = ", ") -> str:
     return between.join(map(str, names[:most])) + more
 
 
+def numbered_frames(frames: Sequence[int], most: int = 8) -> str:
+    """Return "frame" or "frames" with the first numbers, and how many more there are.
+
+    >>> numbered_frames([12]), numbered_frames([12, 30, 31], 2)
+    ('frame 12', 'frames 12, 30 and 1 more')
+    """
+    return f"{'frame' if len(frames) == 1 else 'frames'} {first_of(frames, most)}"
+
+
 def counted(count: int, one: str, several: str = "") -> str:
     """Return a number of things, `one` of them or `several`, which is `one` with an s by default.
 

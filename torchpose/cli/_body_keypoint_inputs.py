@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.terminal import show_progress
-from torchpose._core.wording import first_of
+from torchpose._core.wording import numbered_frames
 from torchpose.cli._track import OTHER_TABLES, is_video
 from torchpose.errors import FileFormatError, InputError, NobodySeenError, SkeletonError
 from torchpose.skeleton._mediapipe_landmarks import count_given
@@ -395,7 +395,7 @@ def _note_on_cuts(frames: "Sequence[FrameKeypoints]") -> tuple[str, ...]:
     if not cuts:
         return ()
     return (
-        f"the video cuts to another scene at frame {first_of(cuts, 8)}, and bodies are tracked on: split it "
+        f"the video cuts to another scene at {numbered_frames(cuts)}, and bodies are tracked on: split it "
         "there",
     )
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.facade import set_up_facade
-from torchpose._core.wording import first_of
+from torchpose._core.wording import numbered_frames
 from torchpose.errors import InputError, OutputError
 from torchpose.upper_body._outlier_notes import (
     exchanged_frames,
@@ -33,7 +33,6 @@ from torchpose.video._person_stream import (
 )
 
 _LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
-_MOST_CUTS = 8  # that a note lists
 
 
 class PoseSpool:
@@ -230,21 +229,25 @@ class TrackedRecording:
         count = person.last_seen + 1
         fields = (_joined(parts, count) for parts in zip(*person.measured, strict=True))
         measured = Measured(*fields)  # type: ignore[arg-type]
-        track = person.poses.track(count)
-        track = replace(
-            track, first_frame=person.first_frame, notes=track.notes + _note_on_cuts(self._cuts)
-        )
         found = TrackedPerson(
-            person.number, person.first_frame, track, measured.keypoints, measured.covariance,
-            measured.confidence, measured.absent,
+            person.number, person.first_frame, person.poses.track(count), measured.keypoints,
+            measured.covariance, measured.confidence, measured.absent,
         )  # fmt: skip
-        return found if smoother is None else self._smoothed(found, smoother)
+        track = (
+            found.track
+            if smoother is None
+            else self._smoothed(measured, person.first_frame, smoother)
+        )
+        notes = track.notes + _note_on_cuts(self._cuts)
+        return replace(found, track=replace(track, first_frame=person.first_frame, notes=notes))
 
-    def _smoothed(self, person: TrackedPerson, smoother: UpperBodyTracker) -> TrackedPerson:
-        """Return a person with smoothed poses: of each scene from the measurements in it."""
-        seen = person.keypoints.isfinite().flatten(1).any(1)
-        cuts = [cut - person.first_frame for cut in self._cuts]
-        bounds = [0, *(cut for cut in cuts if 0 < cut < len(person)), len(person)]
+    def _smoothed(
+        self, measured: Measured, first_frame: int, smoother: UpperBodyTracker
+    ) -> PoseTrack:
+        """Return the smoothed poses of a person: of each scene from the measurements in it."""
+        seen, end = measured.seen, len(measured.keypoints)
+        cuts = [cut - first_frame for cut in self._cuts]
+        bounds = [0, *(cut for cut in cuts if 0 < cut < end), end]
         poses = PoseSpool(self.folder)
         for start, stop in pairwise(bounds):
             there = torch.nonzero(seen[start:stop]).flatten().tolist()
@@ -252,55 +255,41 @@ class TrackedRecording:
             if first > start:
                 poses.append(_nobody(first - start, self.tracker))
             if first < stop:
-                part = _part_of(person, slice(first, stop))
+                part = measured.frames(slice(first, stop))
                 poses.append(smoothed(part, smoother, self.names, self.gap))
-        track = poses.track()
-        notes = track.notes + _note_on_cuts(self._cuts)
-        return replace(person, track=replace(track, first_frame=person.first_frame, notes=notes))
-
-
-def _part_of(person: TrackedPerson, rows: slice) -> TrackedPerson:
-    """Return a person with the measurements of some of the frames."""
-    own = (person.covariance, person.confidence, person.absent)
-    covariance, confidence, absent = (None if values is None else values[rows] for values in own)
-    return replace(
-        person,
-        keypoints=person.keypoints[rows],
-        covariance=covariance,
-        confidence=confidence,
-        absent=absent,
-    )
+        return poses.track()
 
 
 def smoothed(
-    person: TrackedPerson, smoother: UpperBodyTracker, names: Sequence[str], gap: int
+    measured: Measured | TrackedPerson,
+    smoother: UpperBodyTracker,
+    names: Sequence[str],
+    gap: int,
 ) -> PoseTrack:
     """Return the smoothed poses of a person, from all measurements.
 
     Args:
-        person: the person with all measurements. smoother: the smoother of whole recordings.
+        measured: the measurements. smoother: the smoother of whole recordings.
         names: the names of the measured joints. gap: the number of frames without measurements after
             which there is no pose.
     """
     with torch.no_grad():
         confidence, cov = (
             None if values is None else values[None]
-            for values in (person.confidence, person.covariance)
+            for values in (measured.confidence, measured.covariance)
         )
-        absent = None if person.absent is None else absent_for(smoother, person.absent)
-        track = smoother(person.keypoints[None], confidence, names, covariance=cov, absent=absent)
-    seen = person.keypoints.isfinite().flatten(1).any(1)
-    track = without_long_gaps(track, seen, 0, gap)
-    return replace(track, first_frame=person.first_frame)
+        absent = None if measured.absent is None else absent_for(smoother, measured.absent)
+        track = smoother(measured.keypoints[None], confidence, names, covariance=cov, absent=absent)
+    seen = measured.keypoints.isfinite().flatten(1).any(1)
+    return without_long_gaps(track, seen, 0, gap)
 
 
 def _note_on_cuts(cuts: Sequence[int]) -> tuple[str, ...]:
     if not cuts:
         return ()
-    where = f"{'frame' if len(cuts) == 1 else 'frames'} {first_of(cuts, _MOST_CUTS)}"
     return (
-        f"the video cuts to another scene at {where}: everybody is found anew there, and recognised by "
-        "the clothes",
+        f"the video cuts to another scene at {numbered_frames(cuts)}: everybody is found anew there, and "
+        "recognised by the clothes",
     )
 
 
