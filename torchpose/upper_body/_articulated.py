@@ -257,7 +257,7 @@ class ArticulatedFilter(Estimator):
         """Return the estimates of whole sequences; see `Estimator`."""
         smoothing = self.model.smoothing
         if smoothing is None:
-            return super().forward(measured, joints, arm_generators, lengths, progress)
+            return self.filtered(measured, joints, arm_generators, lengths, progress)
         if self.ahead:
             measured = averaged_over_frames(measured, lengths, self.ahead)
         state = self.init(len(measured.uv), joints, arm_generators)
@@ -268,6 +268,17 @@ class ArticulatedFilter(Estimator):
         parts = (found[i : i + _AT_ONCE] for i in range(0, len(found), _AT_ONCE))
         poses = [self._poses(part) for part in parts]
         return repeat_last(self._estimates(poses, len(measured.uv)), lengths)
+
+    def filtered(
+        self,
+        measured: MeasuredJoints,
+        joints: ArmJoints,
+        arm_generators: ArmGenerators,
+        lengths: Tensor | None = None,
+        progress: bool = False,
+    ) -> Estimates:
+        """Return the estimates of whole sequences without smoothing; see `Estimator.forward`."""
+        return super().forward(measured, joints, arm_generators, lengths, progress)
 
     def _steps(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False

@@ -204,9 +204,8 @@ def _covs(
     outer = apart[..., :, None] * apart[..., None, :]
     noise = ((body.std * joints[..., 2]).square() - _NOISE**2).clamp_min(0.0)
     noise[:, _NECK] = 0.0  # which may be put beside other joints, with a wide R
-    still = (_STD**2 + noise)[..., None, None] * torch.eye(
-        3, dtype=joints.dtype, device=joints.device
-    )
+    eye = torch.eye(3, dtype=joints.dtype, device=joints.device)
+    still = (_STD**2 + noise)[..., None, None] * eye
     covs = still + body.scale.square()[:, None, None, None] * outer
     rows = index_tensor(LIMBS, joints.device)
     limbs = covs.index_select(1, rows) + spread + body.others

@@ -149,8 +149,8 @@ class MultipleModelFilter(Estimator):
             poses = _averaged(half, poses, self._steadied(told, lengths))
         predicted = bodies
         if self.articulated.ahead:
-            predicted = Estimator.forward(
-                self.articulated, measured, joints, arm_generators, lengths, progress
+            predicted = self.articulated.filtered(
+                measured, joints, arm_generators, lengths, progress
             )
         ratios = _log_ratios(told, predicted, measured)
         if lengths is not None:

@@ -12,7 +12,7 @@ from torchpose.upper_body._measured_joints import MeasuredJoints
 _REACH = 4 / 30  # seconds before and after a frame
 _MOST = 2.0  # standard deviations of a keypoint that it is moved by
 _FLAT = (
-    1e-6  # relative precision of no velocity and no acceleration: where too few frames tell them
+    1e-6  # relative precision of no velocity and no acceleration, where too few frames tell them
 )
 
 
@@ -51,12 +51,9 @@ def averaged_over_frames(
     uv = _averaged(measured.uv, measured.mask & inside[..., None], measured.cov, reach)
     middle = measured.middle
     if middle is not None:
-        rows = (
-            middle.uv[:, :, None],
-            (middle.mask & inside)[..., None],
-            middle.cov[..., None, :, :],
-        )
-        middle = middle._replace(uv=_averaged(*rows, reach)[:, :, 0])
+        there, cov = (middle.mask & inside)[..., None], middle.cov[..., None, :, :]
+        moved = _averaged(middle.uv[:, :, None], there, cov, reach)
+        middle = middle._replace(uv=moved[:, :, 0])
     return measured._replace(uv=uv, middle=middle)
 
 
