@@ -13,7 +13,7 @@ from tests.upper_body.seen import see_torso
 from torchpose.errors import InputError
 from torchpose.io import read_recordings
 from torchpose.math import euler_to_matrix
-from torchpose.priors._arms import LENGTHS, shipped_arm_prior
+from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.upper_body import UpperBodyTracker
@@ -293,7 +293,7 @@ def test_wrists_end_shorter_forearms_than_hands():
     for end in ("hand", "wrist"):
         names = [name.replace("hand", end) for name in UPPER_BODY]
         track = tracker()(uv, names=names)
-        assert [("are the wrists" in note) for note in track.notes] == [True] * (end == "wrist")
+        assert any("are the wrists" in note for note in track.notes) == (end == "wrist")
         lengths.append(float(torch.linalg.vector_norm(bones(track.joints3d[0, 0], "left")[1])))
     assert lengths[1] < 0.85 * lengths[0]
 
@@ -401,9 +401,22 @@ def test_covariances_of_arms_that_are_measured_whole_are_calibrated():
     own, as_they_are = (tracker(calibrated=c)(uv).covariance3d[0, -1] for c in (True, False))
     arms = [ROW[f"{joint}_{side}"] for joint in ("elbow", "hand") for side in ("left", "right")]
     ratio = own.diagonal(dim1=-2, dim2=-1) / as_they_are.diagonal(dim1=-2, dim2=-1)
-    assert ratio[arms].std() < 1e-9 and 0.4 < float(ratio[arms].mean()) < 0.7
+    assert float(ratio[arms].min()) > 0.4 and float(ratio[arms].mean()) < 0.7
     others = [i for i in range(len(ratio)) if i not in arms]
     torch.testing.assert_close(ratio[others], torch.ones_like(ratio[others]))
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_covariances_of_arms_hold_the_whole_spread_of_sizes_over_persons(calibrated):
+    """A further spread t of the common scale adds t^2 x x^T to a joint at x from the neck."""
+    arms, uv = shipped_arm_prior(), pixels(body(1), 2.0)[None]
+    spread = (arms.spread.square() + 0.05**2).sqrt()
+    varied = ArmPrior(arms.directions, arms.lengths, spread, arms.broad, arms.info, arms.together)
+    usual, wide = (tracker(arms=own, calibrated=calibrated)(uv) for own in (arms, varied))
+    torch.testing.assert_close(wide.joints3d, usual.joints3d)
+    apart = usual.joints3d - usual.joints3d[:, :, [ROW["neck"]]]
+    outer = apart[..., :, None] * apart[..., None, :]
+    torch.testing.assert_close(wide.covariance3d - usual.covariance3d, 0.05**2 * outer)
 
 
 def test_covariances_are_calibrated_by_what_is_measured_of_an_arm():
@@ -458,12 +471,25 @@ def test_poses_without_lengths_are_nobody():
         tracker(person=3)
 
 
-def test_a_known_height_scales_the_body_and_its_distance():
-    uv = pixels(body(60), 2.0)[None]  # both are drawn to 2.6 m at first
-    small, usual = tracker(height=1.36)(uv), tracker(height=1.70)(uv)
-    torch.testing.assert_close(small.bone_lengths[0, 0], 0.8 * usual.bone_lengths[0, 0])
-    depth = [float(track.joints3d[0, -1, ROW["neck"], 2]) for track in (small, usual)]
-    assert depth[0] / depth[1] == pytest.approx(0.8, abs=0.04)
+@pytest.mark.parametrize("smoothing", [None, "full"])
+def test_a_known_height_scales_the_body_and_its_distance(smoothing):
+    uv = pixels(body(40), 2.0)[None]
+    small, usual = (tracker(height=h, smoothing=smoothing)(uv) for h in (1.02, 1.70))
+    for name, factor in (("joints3d", 0.6), ("covariance3d", 0.36), ("bone_lengths", 0.6),
+                         ("bone_covariance", 0.36), ("joints2d", 1.0), ("covariance2d", 1.0)):  # fmt: skip
+        torch.testing.assert_close(getattr(small, name), factor * getattr(usual, name))
+
+
+def test_given_lengths_scale_the_body_and_its_distance():
+    uv = pixels(body(20), 2.0)[None]
+    lengths = {"upper_arm": 0.27, "shoulder_width": 0.33}
+    usual = tracker(bone_lengths=lengths)(uv)
+    small = tracker(bone_lengths={name: 0.6 * metres for name, metres in lengths.items()})(uv)
+    torch.testing.assert_close(small.joints3d, 0.6 * usual.joints3d)
+
+
+def test_a_height_narrows_lengths_and_must_be_that_of_somebody():
+    small = tracker(height=1.36)(pixels(body(2), 2.0)[None])
     spread = small.bone_covariance[0, 0].diagonal().sqrt() / small.bone_lengths[0, 0]
     assert bool((spread <= shipped_arm_prior().spread.max()).all())
     for height in (17.0, 0.0, float("nan"), "1.7"):

@@ -35,7 +35,13 @@ from torchpose.upper_body._articulated_frame import (
     upright,
     with_middle,
 )
-from torchpose.upper_body._articulated_poses import FramePose, SeenBody, estimates_of, pose_of
+from torchpose.upper_body._articulated_poses import (
+    FramePose,
+    SeenBody,
+    enlarged,
+    estimates_of,
+    pose_of,
+)
 from torchpose.upper_body._articulated_root import Roots, RootStep, covs_of_roots
 from torchpose.upper_body._articulated_torso import shoulder_places, torso_joints
 from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths, Sizes
@@ -471,7 +477,8 @@ class ArticulatedFilter(Estimator):
             turn=seen.root.turn[:, 0],
             tilt=seen.tilt,
         )
-        return pose_of(body, arms, self.optics.log_focal, self.model.calibrated)
+        pose = pose_of(body, arms, self.optics.log_focal, self.model.calibrated)
+        return pose if self.lengths.unit == 1.0 else enlarged(pose, self.lengths.unit)
 
     def _estimates(self, poses: Sequence[FramePose], batch_size: int) -> Estimates:
         return estimates_of(poses, batch_size, self.optics.matrix, self.lengths.names)

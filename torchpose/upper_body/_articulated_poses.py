@@ -124,15 +124,16 @@ def pose_of(
         both = body.limbs.all(-1)[..., None, None]
         arms = torch.where(both, _with_lengths(means, body.lengths), means)
     joints = body.joints.index_copy(1, rows, (shoulders[:, :, None] + arms).flatten(1, 2))
-    covs, of_limbs = _covs(body, joints, spread.flatten(1, 2))
-    trust = _trust(body.shoulders, body.limbs, body.exact).to(covs)
+    trust = _trust(body.shoulders, body.limbs, body.exact).to(joints)
+    trust = trust if calibrated else torch.ones_like(trust)
     trust = trust.repeat_interleave(2, 1)[..., None, None]
-    mean_covs = covs.index_copy(1, rows, trust * of_limbs if calibrated else of_limbs)
+    covs, of_limbs = _covs(body, joints, spread.flatten(1, 2), trust)
+    mean_covs = covs.index_copy(1, rows, of_limbs)
     posterior = joints, mean_covs
     if body.whole:
         moved = (means - arms).flatten(1, 2)
         square = moved[..., :, None] * moved[..., None, :]
-        covs = mean_covs.index_add(1, rows, trust * square if calibrated else square)
+        covs = mean_covs.index_add(1, rows, trust * square)
         posterior = joints.index_add(1, rows, moved), mean_covs
     area = 2 * (shoulders[..., 2].mean(1).log() - log_focal)
     evidence = belief.log_evidence + body.limbs.sum(-1) * area[:, None]
@@ -143,6 +144,17 @@ def pose_of(
     return FramePose(
         *pose, *seen, body.tilt @ axes.mT, evidence, log_weights, body.bones.metres, body.bones.covs
     )
+
+
+def enlarged(pose: FramePose, factor: float) -> FramePose:
+    """Return the estimate of the same image of a body so many times as large and as far away.
+
+    Args:
+        pose: the estimate, whose bones are of the larger body already. factor: the factor on its size.
+    """
+    joints, covs, means, mean_covs = pose[:4]
+    square = factor**2
+    return FramePose(factor * joints, square * covs, factor * means, square * mean_covs, *pose[4:])
 
 
 def _tilted(
@@ -191,14 +203,19 @@ def _trust(
 
 
 def _covs(
-    body: SeenBody, joints: Float[Tensor, "B 8 3"], spread: Float[Tensor, "B 4 3 3"]
+    body: SeenBody,
+    joints: Float[Tensor, "B 8 3"],
+    spread: Float[Tensor, "B 4 3 3"],
+    trust: Float[Tensor, "B 4 1 1"],
 ) -> tuple[Float[Tensor, "B 8 3 3"], Float[Tensor, "B 4 3 3"]]:
     """Return the covariances of joints by stiffness, noise and common scale, and all those of `LIMBS`.
 
     Limbs have the spread of the posterior too, in which every hypothesis is on the rays of the keypoints.
+    No keypoint tells the common scale, so its share has no factor.
 
     Args:
         body: the body but for its arms. joints: all of its joints. spread: that of the limbs.
+        trust: the factors on the covariances of the limbs (`_trust`).
     """
     apart = joints - joints[:, _NECK, None]
     outer = apart[..., :, None] * apart[..., None, :]
@@ -206,14 +223,14 @@ def _covs(
     noise[:, _NECK] = 0.0  # which may be put beside other joints, with a wide R
     eye = torch.eye(3, dtype=joints.dtype, device=joints.device)
     still = (_STD**2 + noise)[..., None, None] * eye
-    covs = still + body.scale.square()[:, None, None, None] * outer
+    of_scale = body.scale.square()[:, None, None, None] * outer
     rows = index_tensor(LIMBS, joints.device)
-    limbs = covs.index_select(1, rows) + spread + body.others
+    limbs = still.index_select(1, rows) + spread + body.others
     # seen hands are as far from shoulders that are not as the body is away
     inferred = body.far[:, None] * ~body.shoulders
     hands = limbs.view(-1, 2, 2, 3, 3)[:, :, 1, :2, :2]
     hands += inferred[..., None, None] * outer[:, HANDS, :2, :2]
-    return covs, limbs
+    return still + of_scale, trust * limbs + of_scale.index_select(1, rows)
 
 
 def estimates_of(

@@ -100,7 +100,8 @@ class RootStep(NamedTuple):
         believed = self.grid.predict(belief, farther) * likelihood
         if frame.face is not None:
             std = frame.given.std.amin(1)
-            of_face = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
+            metres = self.lengths.unit * self.grid.depth  # heads of children are nearly full-grown
+            of_face = face_evidence(frame.face, std, metres, self.grid.turn)
             believed = believed * of_face[:, None].exp()
         if fresh is not None:
             far = self.grid.at_all_depths(believed)

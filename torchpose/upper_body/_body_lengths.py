@@ -72,7 +72,7 @@ class Lengths(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Lengths of a body, metres.
+    """Lengths of a body, metres at the size of the prior's persons (`BodyLengths.unit`).
 
     Attributes:
         metres: of `BODY_LENGTHS`, [B, 4]. slack: the standard deviations of both bones of an arm, [B, 2];
@@ -89,6 +89,8 @@ class BodyLengths:
 
     One camera does not tell a large body that is far from a small one that is near. So of all lengths
     the surest stays as the prior, or who measured it, has it, and the others are learnt relative to it.
+    Whoever is known to be larger or smaller is followed at the size of the prior's persons, on whom all
+    constants in metres were chosen, and enlarged by `unit` at the end.
 
     Args:
         prior: the prior over persons. hand: the kind of the measured hands, "hand" or "wrist".
@@ -98,6 +100,7 @@ class BodyLengths:
 
     Attributes:
         names: the names of the lengths, as `LENGTHS` has them.
+        unit: how many times as large the subject is known to be as the prior's persons.
 
     Raises:
         InputError: an unknown name, a length or a height that nobody has, or poses without lengths.
@@ -113,6 +116,7 @@ class BodyLengths:
         self.lower = like.new_tensor([0.0, 0.0, 0.0, NECK_HEIGHT - self.neck])
         self.usual = prior.lengths[rows].to(like) + self.lower
         self.spread = prior.spread[rows].to(like)
+        self.unit = 1.0
         if known.height is not None:
             self._grow(known.height)
         if known.person is not None:
@@ -130,7 +134,7 @@ class BodyLengths:
 
     def _grow(self, height: float) -> None:
         """Expect the lengths of a person of this height."""
-        self.usual = self.usual * (check_height(height) / _HEIGHT)
+        self.unit = check_height(height) / _HEIGHT
         left = (self.spread.square() - _OF_HEIGHT**2).clamp_min(_LEAST**2)
         self.spread = left.sqrt().minimum(self.spread)
 
@@ -178,8 +182,10 @@ class BodyLengths:
 
     def _expect(self, rows: list[int], metres: Tensor, spread: Tensor) -> None:
         """Expect these lengths, and the others in proportion."""
-        self.usual = self.usual * (metres / self.usual[rows]).log().mean().exp()
-        self.usual[rows] = metres
+        factors = metres / self.usual[rows]
+        self.unit = float(factors.log().mean().exp())
+        self.usual = self.usual.clone()
+        self.usual[rows] *= factors / self.unit
         self.spread = self.spread.clone()
         self.spread[rows] = self.spread[rows].minimum(spread)
 
@@ -208,13 +214,13 @@ class BodyLengths:
         return Lengths(torch.zeros_like(precision), precision)
 
     def metres(self, lengths: Lengths) -> Float[Tensor, "B 4"]:
-        """Return the lengths, metres."""
+        """Return the lengths, metres at the size of the prior's persons."""
         return self.usual * lengths.mean.exp()
 
     def shown(
         self, lengths: Lengths, size: Float[Tensor, " B"], unsure: Float[Tensor, " B"]
     ) -> Bones:
-        """Return the lengths as they are reported, heads above Kinect's neck.
+        """Return the lengths as they are reported, of the subject's own size, heads above Kinect's neck.
 
         Their covariances are those of a common scale, of the size of the torso, and of each length by
         itself.
@@ -226,6 +232,8 @@ class BodyLengths:
         own = torch.diag_embed(lengths.precision.reciprocal() * self._own)
         logs = torch.addcmul(own + self.scale.square(), unsure[:, None, None], self._torso)
         metres = self.metres(lengths) * size[:, None] ** self._torso[-1]
+        if self.unit != 1.0:
+            metres = self.unit * metres
         return Bones(self.names, metres - self.lower, metres[:, :, None] * logs * metres[:, None])
 
     def sizes(self, lengths: Lengths) -> Sizes:
