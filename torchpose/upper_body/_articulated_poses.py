@@ -229,8 +229,8 @@ def _covs(
     # seen hands are as far from shoulders that are not as the body is away
     inferred = body.far[:, None] * ~body.shoulders
     hands = limbs.view(-1, 2, 2, 3, 3)[:, :, 1, :2, :2]
-    hands += inferred[..., None, None] * outer[:, HANDS, :2, :2]
-    return still + of_scale, trust * limbs + of_scale.index_select(1, rows)
+    hands.addcmul_(inferred[..., None, None], outer[:, HANDS, :2, :2])
+    return still + of_scale, torch.addcmul(of_scale.index_select(1, rows), trust, limbs)
 
 
 def estimates_of(
