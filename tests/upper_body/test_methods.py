@@ -25,7 +25,6 @@ from torchpose.upper_body._estimator import arm_joints
 from torchpose.upper_body._measured_joints import in_prior_pixels
 from torchpose.upper_body._picked import pick_joints
 from torchpose.upper_body._tracker_options import MethodOptions
-from torchpose.upper_body._upper_body_tracker import _UNSIZED
 
 NAMES = list(KEYPOINT_NAMES)
 
@@ -46,7 +45,7 @@ def without_windows(prior):
 
 def test_windows_and_bones_are_the_default_where_the_prior_has_windows(prior, keypoints):
     track = poses(UpperBodyTracker(prior, demo_camera()), keypoints)
-    assert track.method == "multiple-model" and track.notes == (_UNSIZED,)
+    assert track.method == "multiple-model" and track.notes == ()
     named = poses(UpperBodyTracker(prior, demo_camera(), "multiple-model"), keypoints)
     assert torch.equal(track.joints3d, named.joints3d)
 
@@ -80,8 +79,7 @@ def test_bones_are_the_default_where_wrists_are_measured(prior, seen):
 def test_bones_are_the_default_where_they_are_known_and_no_other_method_is_asked_for(prior, seen):
     names = [name.replace("hand", "wrist") for name in UPPER_BODY]
     for options in ({"height": 1.7}, {"bone_lengths": {"forearm": 0.3}}):
-        track = UpperBodyTracker(prior, demo_camera(), **options)(seen)
-        assert track.method == "articulated" and track.notes == ()
+        assert UpperBodyTracker(prior, demo_camera(), **options)(seen).method == "articulated"
     for options in ({"steady": False}, {"likelihood_power": 0.5}):
         tracker = UpperBodyTracker(prior, demo_camera(), **options)
         assert tracker(seen, names=names).method == "window-mixture"
@@ -91,7 +89,7 @@ def test_bones_are_the_default_of_all_joints_where_no_window_suits(prior, seen):
     late = UpperBodyTracker(prior, demo_camera(), smoothing=1)
     assert late.method == "mkf-fixed" and late.notes
     track = late(seen)
-    assert track.method == "articulated" and track.notes == (_UNSIZED,)
+    assert track.method == "articulated" and track.notes == ()
     hidden = seen.clone()
     hidden[:, :, [UPPER_BODY.index(f"elbow_{side}") for side in ("left", "right")]] = torch.nan
     assert late(hidden).method == "mkf-fixed"
@@ -101,11 +99,11 @@ def test_bones_are_the_default_of_all_joints_where_no_window_suits(prior, seen):
 def test_single_poses_are_the_default_without_windows(prior, keypoints, smoothing):
     bare = without_windows(prior)
     track = poses(UpperBodyTracker(bare, demo_camera(), smoothing=smoothing), keypoints)
-    assert track.method == "mkf-fixed" and track.notes == (_UNSIZED,)
+    assert track.method == "mkf-fixed" and track.notes == ()
     named = poses(
         UpperBodyTracker(bare, demo_camera(), "mkf-fixed", smoothing=smoothing), keypoints
     )
-    assert torch.equal(track.joints3d, named.joints3d) and named.notes == (_UNSIZED,)
+    assert torch.equal(track.joints3d, named.joints3d) and named.notes == ()
     with pytest.raises(InputError, match=r"brings no mixtures .* use method 'mkf-fixed'"):
         UpperBodyTracker(bare, demo_camera(), "window-mixture", smoothing=smoothing)
 

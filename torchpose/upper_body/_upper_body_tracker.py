@@ -71,11 +71,6 @@ from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model
 from torchpose.upper_body._screening import screen_joints
 from torchpose.upper_body._tracker_options import MethodOptions
 
-_OF_SIZE = ("height", "bone_lengths", "person")  # options that tell the size of a person
-_UNSIZED = (
-    "one camera cannot measure the size of a person: size and distance are those of an average person; "
-    "give height or bone_lengths, which method 'articulated' takes, if one of them is known"
-)
 _NO_EXPORT = (
     "UpperBodyTracker, which chooses its filters by what was measured,",
     "a step of a filter of torchpose.filters",
@@ -441,11 +436,9 @@ class UpperBodyTracker(WideModule):
         return state, track.in_precision(self.dtype)
 
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
-        """Return the notes about the choice of the method, the kinds of neck and hands, and the size."""
+        """Return the notes about the choice of the method and about the kinds of neck and hands."""
         chosen = self.notes if method == self.method else ()
-        sized = any(self.options.get(name) is not None for name in _OF_SIZE)
-        size = () if sized else (_UNSIZED,)
-        return chosen + picked.notes + picked.hand_notes(estimator.knows_wrists) + size
+        return chosen + picked.notes + picked.hand_notes(estimator.knows_wrists)
 
     def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
         info = self.prior.info
