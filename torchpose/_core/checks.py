@@ -18,6 +18,8 @@ from torchpose.errors import (
 
 MOST_CONFIDENCE = 2.0
 """Of a keypoint: peaks of heat maps may exceed 1, and count as 1; more is a score in percent."""
+CONFIDENCE_ADVICE = "divide scores in percent by 100, and take the sigmoid of logits"
+"""What to do with confidences of another scale."""
 STAYS_POSITIVE = "what is learnt stays positive as the exponential of a parameter"
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second

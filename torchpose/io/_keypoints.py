@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import MOST_CONFIDENCE, check_pixels, check_rate
+from torchpose._core.checks import CONFIDENCE_ADVICE, MOST_CONFIDENCE, check_pixels, check_rate
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose._core.wording import counted
@@ -331,11 +331,12 @@ def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]
     confidence = np.nan_to_num(confidence, nan=0.0, posinf=math.inf, neginf=-math.inf)
     if (confidence < 0).any() or np.isinf(confidence).any():
         bad = confidence[(confidence < 0) | np.isinf(confidence)][0]
-        raise FileFormatError(f"{path}: confidences must be finite and at least 0, got {bad:g}")
+        raise FileFormatError(
+            f"{path}: confidences must be finite and at least 0, got {bad:g}; {CONFIDENCE_ADVICE}"
+        )
     if confidence.max(initial=0.0) > MOST_CONFIDENCE:
         raise FileFormatError(
-            f"{path}: confidences must lie in [0, 1], got {confidence.max():g}; divide scores in percent "
-            "by 100"
+            f"{path}: confidences must lie in [0, 1], got {confidence.max():g}; {CONFIDENCE_ADVICE}"
         )
     return confidence.clip(max=1.0)
 

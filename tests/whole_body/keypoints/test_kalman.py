@@ -671,6 +671,7 @@ def test_names_of_a_stream_hold_for_all_frames(four):
             "must be a dense tensor, got torch.sparse_coo",
         ),
         ({"confidence": lambda c: 100 * c}, InputError, "divide scores in percent by 100"),
+        ({"confidence": lambda c: c.logit()}, InputError, "take the sigmoid of logits"),
         ({"keypoints": lambda k: k.repeat(1, 1, 2, 1)}, ShapeError, "BODY_15, whose names count"),
     ],
 )
@@ -687,6 +688,15 @@ def test_peaks_of_heat_maps_count_as_one(four):
         for value in (1.0, 1.02)
     )
     torch.testing.assert_close(peaks.joints3d, plain.joints3d, rtol=0, atol=0)
+
+
+def test_confidences_of_another_scale_are_named(four):
+    frames = four.keypoints[:4]
+    said = [
+        "confidence below 0.1" in " ".join(tracker(four.rig)(keypoints=frames, confidence=c).notes)
+        for c in (0.03 * four.confidence[:4], 0.3 * four.confidence[:4], None)
+    ]
+    assert said == [True, False, False]
 
 
 def test_single_precision_leaves_the_filter_double(four):

@@ -13,6 +13,7 @@ TOO_FEW = "too few keypoints were given"
 """Why a track begins late."""
 
 _DISAGREES = 0.5  # share of a camera's keypoints that fit no joint, above which it is said
+_UNSURE = 0.1  # confidence below which half of the keypoints hardly count
 _MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
 _GAP = 30  # frames without keypoints that are worth a word
 _LEAST_TURN = (
@@ -109,6 +110,22 @@ def _notes_on_joints_without_keypoints(there: Bool[Tensor, "T C J"]) -> list[str
         f"no camera has a keypoint of {joints} in any frame: they are guessed from how the people of the "
         "prior stand and move, and may be off by half a metre if the person sits or lies"
     ]
+
+
+def notes_on_unsure_keypoints(inlier: Float[Tensor, "T C J"]) -> tuple[str, ...]:
+    """Return a note if most keypoints are of so low a confidence that they hardly count.
+
+    Args:
+        inlier: prior probability that a keypoint is its joint's, 0 where there is none.
+    """
+    there = inlier[inlier > 0]
+    if not len(there) or float(there.median()) >= _UNSURE:
+        return ()
+    return (
+        f"half of the keypoints or more have a confidence below {_UNSURE:g}, and hardly count: confidence is "
+        "the probability that a keypoint is right; scale values of another kind, such as peaks of heat maps "
+        "that sum to 1, so that sure keypoints are near 1, or leave them out",
+    )
 
 
 def notes_on_size(height: float, n_cameras: int, sized: bool) -> tuple[str, ...]:

@@ -6,7 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import MOST_CONFIDENCE, check_pixels, check_shape, refuse_half
+from torchpose._core.checks import (
+    CONFIDENCE_ADVICE,
+    MOST_CONFIDENCE,
+    check_pixels,
+    check_shape,
+    refuse_half,
+)
 from torchpose.body._feet import foot_points
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
@@ -61,7 +67,7 @@ class KeypointReader:
         if bool(outside.any()):
             raise InputError(
                 f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "
-                "divide scores in percent by 100"
+                f"{CONFIDENCE_ADVICE}"
             )
         trust = trust.clamp(0.0, 1.0)
         there = known & (trust > 0)

@@ -26,6 +26,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_size,
     notes_on_still_cameras,
     notes_on_turned_cameras,
+    notes_on_unsure_keypoints,
     notes_on_up,
     notes_on_upside_down_cameras,
 )
@@ -127,6 +128,7 @@ class TrackBuilder:
             self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
             poses.off, self.sized, first_frame,
         )  # fmt: skip
+        notes += notes_on_unsure_keypoints(frame.inlier)
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
         notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)
         notes += notes_on_up(self.tracker.filter.up, poses.joints)
