@@ -408,7 +408,8 @@ def body_joints(
     if missing:
         raise SkeletonError(
             f"a whole body needs shoulders and hips; {', '.join(missing)} are not among "
-            f"{', '.join(map(str, names))}; an upper body alone is for UpperBodyTracker (torchpose track)"
+            f"{', '.join(map(str, names))}; an upper body alone is for UpperBodyTracker (torchpose track), "
+            "and joints that nothing measures, such as shoulders beside legs, may be NaN (empty cells)"
         )
     unknown = torch.full_like(joints[..., 0, :], torch.nan)
     picked = [unknown if i is None else joints[..., i, :] for i in found]
