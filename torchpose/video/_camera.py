@@ -119,12 +119,8 @@ class CameraSource(VideoSource):
     def _read(self) -> Iterator[VideoFrame]:
         import cv2
 
-        index, due, n_read, n_pauses = (
-            -1,
-            0.0,
-            0,
-            0,
-        )  # the next frame is due after this many seconds
+        index, n_read, n_pauses = -1, 0, 0
+        due = 0.0  # seconds after which the next frame is expected
         try:
             for image, seconds in self._images():
                 late = (seconds - due) * self.fps  # in frames

@@ -69,9 +69,8 @@ from torchpose.whole_body._keypoints.only_camera import OnlyCamera
 from torchpose.whole_body._keypoints.pose_maker import PoseMaker
 from torchpose.whole_body._keypoints.watched_cameras import by_right_cameras
 
-_Found = tuple[
-    KeypointStream, CorrectedBody, Bool[Tensor, " B"]
-]  # the last: who begins with the frame
+# What is found in a frame; the last are those who begin with it.
+_Found = tuple[KeypointStream, CorrectedBody, Bool[Tensor, " B"]]
 
 
 class KeypointTracker(nn.Module):
@@ -219,9 +218,8 @@ class KeypointTracker(nn.Module):
         due = ~stream.begun | are_lost(stream.lost, self.filter.fps)
         if lifted is not None:
             due = due | contradicts(lifted, self.filter, predicted)
-        due = (due | self._seen_again(stream, frame)) & may_begin(
-            frame, stream.lost, self.filter.fps
-        )
+        due = due | self._seen_again(stream, frame)
+        due = due & may_begin(frame, stream.lost, self.filter.fps)
         if bool(due.any()):
             found = self._begun_anew(found, frame, lifted, due)
         stream = stream._replace(

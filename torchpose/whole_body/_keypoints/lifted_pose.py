@@ -249,13 +249,14 @@ def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) 
         filter: whose states they are. state: [B].
     """
     body, mean, cov = filter.articulation, state.mean, state.cov
-    k = telling(filter.maps, body.joints(mean))[..., None]
+    at_mean = body.linearise(mean)
+    k = telling(filter.maps, at_mean[0])[..., None]
     wanted = lifted.joints[..., _OTHERS, :]
     scale = 1 / (_FACTOR * k[..., None] * lifted.std[..., _OTHERS, None])
     wanted, scale = wanted.flatten(-2), scale.expand_as(wanted).flatten(-2)
     point, d = mean, torch.zeros_like(cov[..., 0])
-    for _ in range(_ITERATIONS):
-        joints, jacobian = body.linearise(point)
+    for iteration in range(_ITERATIONS):
+        joints, jacobian = body.linearise(point) if iteration else at_mean
         apart = (joints - joints[..., [_PELVIS], :])[..., _OTHERS, :]
         H = (jacobian - jacobian[..., [_PELVIS], :, :])[..., _OTHERS, :, :].flatten(-3, -2)
         apart, H = _of_expected_size(filter, point, apart.flatten(-2), H, 1 - 1 / k)
