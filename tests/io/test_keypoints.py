@@ -347,12 +347,20 @@ def test_depths_and_times_of_tables_are_passed_over(tmp_path, lines, left_out):
 def test_time_stamps_give_the_rate(tmp_path, stamp, frames):
     rows = [f"{stamp.format(f / 25)};{f};10,5;20" for f in frames]
     read = read_keypoints(text(tmp_path, "timestamp;frame;head_x;head_y", *rows))
-    assert read.fps == pytest.approx(25.0) and read.keypoints[0].tolist() == [[10.5, 20.0]]
+    # Seconds since 1970 resolve a quarter of a microsecond.
+    assert read.fps == pytest.approx(25.0, rel=1e-5)
+    assert read.keypoints[0].tolist() == [[10.5, 20.0]]
     assert read.notes == ("time stamps taken for seconds: 25 frames per second",)
     stated = read_keypoints(text(tmp_path, "# fps = 24", "timestamp;frame;head_x;head_y", *rows))
     assert stated.fps == 24.0
     rows = [row.replace(";", "@:;", 1) for row in rows]  # times of no known form are passed over
     assert read_keypoints(text(tmp_path, "time;frame;head_x;head_y", *rows)).fps is None
+
+
+def test_time_stamps_in_whole_milliseconds_give_the_rate_of_their_mean(tmp_path):
+    rows = [f"{1000 * f // 30},{f},10,20" for f in (*range(20), *range(35, 50))]
+    read = read_keypoints(text(tmp_path, "timestamp,frame,head_x,head_y", *rows))
+    assert read.fps == pytest.approx(30.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("mark", [";", "\t"])
