@@ -289,7 +289,8 @@ def test_visibility_of_arrays_is_the_confidence_where_there_is_none(tmp_path):
     ("lines", "word"),
     [
         ([""], "empty"),
-        (["time,head_x,head_y", "0,1,2"], "line 1.*header"),
+        (["time,head,neck", "0,1,2"], "line 1.*header"),
+        (["moment,head_x,head_y", "0,1,2"], "delete or rename moment"),
         (["frame"], "columns"),
         (["frame,head_x", "0,1"], r"head_y \(absent\)"),
         (["frame,head_x,head_y,colour", "0,1,2,3"], "colour"),
@@ -355,6 +356,32 @@ def test_time_stamps_give_the_rate(tmp_path, stamp, frames):
     assert stated.fps == 24.0
     rows = [row.replace(";", "@:;", 1) for row in rows]  # times of no known form are passed over
     assert read_keypoints(text(tmp_path, "time;frame;head_x;head_y", *rows)).fps is None
+
+
+def test_a_table_without_frames_has_them_by_its_times(tmp_path):
+    times = [0, 34, 66, 166, 201]  # milliseconds; two frames are absent
+    rows = [f"{time},{time},20" for time in times]
+    read = read_keypoints(text(tmp_path, "timestamp,head_x,head_y", *rows))
+    assert read.keypoints[:, 0, 0].nan_to_num(-1).tolist() == [0, 34, 66, -1, -1, 166, 201]
+    assert read.fps == pytest.approx(30, rel=0.02)
+    long = [f"{time},{name},{time},20" for time in times for name in ("head", "neck")]
+    again = read_keypoints(text(tmp_path, "time,name,x,y", *long))
+    assert torch.equal(again.keypoints[:, 1].nan_to_num(), read.keypoints[:, 0].nan_to_num())
+
+
+@pytest.mark.parametrize("times", [(0, 2, 1), (0, 1, ""), (0, 1, 1), (0, 1, "soon"), (0, 1, 10**7)])
+def test_times_in_place_of_frames_increase(tmp_path, times):
+    rows = [f"{time},10,20" for time in times]
+    with pytest.raises(FileFormatError, match="line 4: "):
+        read_keypoints(text(tmp_path, "timestamp,head_x,head_y", *rows))
+
+
+def test_rows_without_frames_and_times_are_frames(tmp_path):
+    read = read_keypoints(text(tmp_path, "head_x,head_y", "1,2", "3,4", "5,6"))
+    assert read.keypoints[:, 0, 0].tolist() == [1, 3, 5]
+    assert read.notes == (
+        "no column of frames or times: each row is taken for the frame after the last",
+    )
 
 
 def test_time_stamps_in_whole_milliseconds_give_the_rate_of_their_mean(tmp_path):

@@ -19,7 +19,14 @@ from torchpose._core.reading import (
 from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
-from torchpose.io._formats.table_rows import frame_rate, is_time, split_row, split_rows, stamp_of
+from torchpose.io._formats.table_rows import (
+    frame_rate,
+    is_time,
+    split_row,
+    split_rows,
+    stamp_of,
+    usual_step,
+)
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _SHOWN = 3  # columns that a message lists
@@ -35,8 +42,12 @@ _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a d
 
 
 def is_keypoint_header(cells: Sequence[str]) -> bool:
-    """Return whether the cells of a first line name a column of frames, or begin DeepLabCut's header."""
-    return any(cell.lower() in (*_FRAMES, "scorer") for cell in cells)
+    """Return whether the cells of a first line name frames or x and y alone, or begin DeepLabCut's header."""
+    lower = [cell.lower() for cell in cells]
+    flat = {cell[-2:] for cell in lower}
+    return any(cell in (*_FRAMES, "scorer") for cell in lower) or (
+        flat >= {"_x", "_y"} and "_z" not in flat
+    )
 
 
 @dataclass
@@ -88,12 +99,8 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
             f"{path}: expected a table of one camera, got one of several, as Caliscope writes it; write a "
             "table frame,landmark,x,y of each from sync_index, names of point_id, img_loc_x and img_loc_y"
         )
-    if not any(name in header for name in _FRAMES):
-        raise FileFormatError(
-            f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
-            f"or frame,name,x,y[,confidence], got {','.join(rows[0][1])[:60]!r}"
-        )
-    rows, left_out, times = _without_other_columns(rows)
+    counted = any(name in header for name in _FRAMES)
+    rows, left_out, times = _without_other_columns(rows if counted else _with_frames(path, rows))
     header = rows[0][1]
     long = len(header) > 1 and header[1].lower() in _NAMES
     raw = _long_rows(path, header, rows[1:]) if long else _wide_rows(path, header, rows[1:])
@@ -107,6 +114,10 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
     if left_out:
         shown = first_of(left_out, _SHOWN)
         raw.notes += (f"columns {shown} are passed over: x, y and a score of keypoints count",)
+    if not counted and not times:
+        raw.notes += (
+            "no column of frames or times: each row is taken for the frame after the last",
+        )
     return raw
 
 
@@ -123,6 +134,59 @@ def _from_deeplabcut(path: Path, rows: _Rows) -> _Rows:
     pairs = zip(lines["bodyparts"][1:], lines["coords"][1:], strict=False)
     header = ["frame", *(f"{part}_{kind}" for part, kind in pairs)]
     return [(rows[0][0], header), *rows[len(lines.keys() & _DEEPLABCUT) :]]
+
+
+def _with_frames(path: Path, rows: _Rows) -> _Rows:
+    """Return rows with a column of frames in front, by their times, or counted in a table without times.
+
+    Times that are several usual steps apart have missing frames between them; equal ones are one frame.
+    """
+    header = rows[0][1]
+    time = next((i for i, cell in enumerate(header) if is_time(cell)), None)
+    lower = {cell.lower() for cell in header}
+    if not (
+        {cell[-2:] for cell in lower} >= {"_x", "_y"} or (time is not None and lower >= {"x", "y"})
+    ):
+        raise FileFormatError(
+            f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
+            f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
+        )
+    frames = range(len(rows) - 1)
+    if time is not None:
+        frames = _frames_by_times(path, [(number, cells[time]) for number, cells in rows[1:]])
+    numbered = zip(rows[1:], frames, strict=True)
+    return [
+        (rows[0][0], ["frame", *header]),
+        *((number, [str(frame), *cells]) for (number, cells), frame in numbered),
+    ]
+
+
+def _frames_by_times(path: Path, cells: list[tuple[int, str]]) -> list[int]:
+    """Return the number of each row's frame, given the lines and time stamps of rows."""
+    stamps = np.array([_stamp(path, number, cell) for number, cell in cells])
+    steps = np.diff(stamps)
+    bad = ~(steps >= 0)  # NaN included
+    if bad.any():
+        number, cell = cells[1 + int(np.flatnonzero(bad)[0])]
+        raise FileFormatError(
+            f"{path}, line {number}: expected times that increase, as there is no column of frames, "
+            f"got {cell or 'none'}"
+        )
+    usual = usual_step(steps[steps > 0]) if (steps > 0).any() else 1.0
+    if (steps > _MAX_GAP * usual).any():
+        number, cell = cells[1 + int(steps.argmax())]
+        raise FileFormatError(
+            f"{path}, line {number}: expected the next time, got {cell}, far later"
+        )
+    frames = np.where(steps > 0, np.rint(steps / usual).clip(min=1), 0).astype(int)
+    return [0, *frames.cumsum().tolist()][: len(cells)]
+
+
+def _stamp(path: Path, number: int, cell: str) -> float:
+    try:
+        return stamp_of(cell)
+    except ValueError as error:
+        raise FileFormatError(f"{path}, line {number}: {error}") from error
 
 
 def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str], list[str]]:

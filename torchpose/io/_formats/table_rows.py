@@ -92,18 +92,28 @@ def stamp_of(cell: str) -> float:
     return (time if time.tzinfo else time.replace(tzinfo=datetime.UTC)).timestamp()
 
 
+def usual_step(steps: np.ndarray) -> float:
+    """Return the mean of the steps within a fifth of their median, of one or more positive ones.
+
+    Stamps in whole milliseconds have a median of 33 at 30 frames per second.
+
+    >>> usual_step(np.array([33, 33, 34, 33, 67, 33, 34, 34, 33]))
+    33.375
+    """
+    median = np.quantile(steps, 0.5, method="lower")
+    return float(steps[np.abs(steps - median) <= 0.2 * median].mean())
+
+
 def frame_rate(steps: np.ndarray) -> tuple[float | None, str]:
     """Return the frames per second by the usual step between time stamps, and a note on their unit.
 
-    It is the mean of the steps within a fifth of their median, which has the rate of stamps in whole
-    milliseconds: 33, 33 and 34 are 30 frames per second, and their median 30.3. Of seconds, milliseconds, microseconds, 100 ns and nanoseconds, the one that comes nearest to 30
+    Of seconds, milliseconds, microseconds, 100 ns and nanoseconds, the one that comes nearest to 30
     frames per second; None for steps that are none of them, such as numbers of frames.
     """
     steps = steps[steps > 0]
     if not len(steps):
         return None, ""
-    median = np.median(steps)
-    step = float(steps[np.abs(steps - median) <= 0.2 * median].mean())
+    step = usual_step(steps)
     rates = {name: 1 / (tick * step) for tick, name in _TICKS.items()}
     name = min(rates, key=lambda name: abs(math.log(rates[name] / KINECT_FPS)))
     if not _SLOWEST <= rates[name] <= FASTEST:
