@@ -151,7 +151,7 @@ def _with_frames(path: Path, rows: _Rows) -> _Rows:
             f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
             f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
         )
-    frames = range(len(rows) - 1)
+    frames: Sequence[int] = range(len(rows) - 1)
     if time is not None:
         frames = _frames_by_times(path, [(number, cells[time]) for number, cells in rows[1:]])
     numbered = zip(rows[1:], frames, strict=True)
