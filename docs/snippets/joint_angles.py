@@ -20,13 +20,19 @@ def angle(joints: Tensor) -> Tensor:
     return torch.atan2(across, (one * other).sum(-1)).rad2deg()
 
 
-def angle_with_std(joints: Tensor, covs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the angle, and its standard deviation to first order from covariances [..., 3, 3, 3]."""
+def angle_with_std(joints: Tensor, covs: Tensor, shared: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Return the angle, and its standard deviation to first order from covariances [..., 3, 3, 3].
+
+    shared: correlation of the errors of the three joints, each along the axes of its covariance.
+    """
     joints = joints.detach().requires_grad_()
     found = angle(joints)
     (slope,) = torch.autograd.grad(found.sum(), joints)
-    variance = torch.einsum("...jx,...jxy,...jy->...", slope, covs, slope)
-    return found.detach(), variance.sqrt()
+    variances, axes = torch.linalg.eigh(covs.nan_to_num())  # no pose stays NaN
+    roots = axes * variances.clamp_min(0).sqrt()[..., None, :] @ axes.mT
+    moved = (roots @ slope[..., None]).squeeze(-1)
+    together, apart = moved.sum(-2).square().sum(-1), moved.square().sum((-2, -1))
+    return found.detach(), (shared * together + (1 - shared) * apart).sqrt()
 
 
 camera = PinholeCamera(900, 900, 639.5, 359.5, 1280, 720, "cam", translation=(0, 0, 3))
@@ -40,7 +46,7 @@ track = BodyTracker(rig, "kalman", fps=30, height=1.75)(
 for name, joints in ANGLES.items():
     rows = [BODY_15.names.index(joint) for joint in joints]
     covs = track.details["covariance_from_pelvis"][:, rows]  # of several cameras: covariance3d
-    mean, std = angle_with_std(track.joints3d[:, rows], covs)
+    mean, std = angle_with_std(track.joints3d[:, rows], covs, shared=0.5)  # of several: 0
     error = (mean - angle(truth[:, rows]))[-1].abs()
     print(name, bool(error < 2 * std[-1]), bool(std[-1] < 40))
 # > elbow True True
