@@ -45,8 +45,8 @@ track = BodyTracker(rig, "kalman", fps=30, height=1.75)(
 )
 for name, joints in ANGLES.items():
     rows = [BODY_15.names.index(joint) for joint in joints]
-    covs = track.details["covariance_from_pelvis"][:, rows]  # of several cameras: covariance3d
-    mean, std = angle_with_std(track.joints3d[:, rows], covs, shared=0.5)  # of several: 0
+    covs = track.details["covariance_from_pelvis"][:, rows]  # of cameras apart: covariance3d
+    mean, std = angle_with_std(track.joints3d[:, rows], covs, shared=0.5)  # apart: 0
     error = (mean - angle(truth[:, rows]))[-1].abs()
     print(name, bool(error < 2 * std[-1]), bool(std[-1] < 40))
 # > elbow True True

@@ -74,10 +74,11 @@ class BodyTrack:
             as "acceptance", "clamped" and "actions" of `ConstrainedParticleFilter`; of "kalman" "inlier"
             [T, C, J] (probability that a camera's keypoint was the joint's), "exchanged" [T, C, 2] (that
             left and right were exchanged, of arms and of legs), "bone_lengths" [T, J], metres, of one camera
-            "covariance_from_pelvis" [T, J, 3, 3] (of joints relative to the pelvis, metres squared), where
-            a camera was found to be turned "camera_turn" [T, C, 3, 3] (D in world axes: a camera whose
-            calibration has the rotation R and the centre c sees a point x in the direction R D^T (x - c) of
-            its axes), and where keypoints have some of feet what `feet` is made of.
+            and of cameras side by side "covariance_from_pelvis" [T, J, 3, 3] (of joints relative to the
+            pelvis, metres squared), where a camera was found to be turned "camera_turn" [T, C, 3, 3] (D in
+            world axes: a camera whose calibration has the rotation R and the centre c sees a point x in the
+            direction R D^T (x - c) of its axes), and where keypoints have some of feet what `feet` is made
+            of.
         action_names: the names of the columns of ``details["actions"]``.
         method: the name of the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files
             of older releases.

@@ -75,6 +75,18 @@ def test_ellipsoids_hold_the_joints(noisy, track):
     assert float(inside) > 0.85
 
 
+def test_ellipsoids_from_the_pelvis_hold_the_joints_and_not_the_place(noisy, track):
+    joints, _, _ = noisy
+    cov = track.details["covariance_from_pelvis"]
+    pelvis = BODY_15.joint("pelvis")
+    others = [joint for joint in range(len(NAMES)) if joint != pelvis]
+    given = (relative(track.joints3d), cov, relative(joints))
+    assert float(coverage(*(value[:, others] for value in given)).overall[1]) > 0.8
+    assert not cov[:, pelvis].any()
+    variances = (x[:, LEGS].diagonal(dim1=-2, dim2=-1).sum() for x in (cov, track.covariance3d))
+    assert next(variances) < 0.25 * next(variances)
+
+
 def test_live_poses_are_those_of_the_recording(noisy, track):
     _, rig, keypoints = noisy
     tracker = torchpose.BodyTracker(rig, "kalman", fps=FPS)
@@ -82,6 +94,8 @@ def test_live_poses_are_those_of_the_recording(noisy, track):
     for t in range(4):
         stream, pose = tracker.step(stream, keypoints=keypoints[t], names=NAMES)
         torch.testing.assert_close(pose.joints3d[0], track.joints3d[t])
+        live, whole = (x.details["covariance_from_pelvis"] for x in (pose, track))
+        torch.testing.assert_close(live[0], whole[t])
 
 
 def test_one_of_the_two_alone_is_followed_until_the_other_is_back(noisy):
@@ -89,6 +103,8 @@ def test_one_of_the_two_alone_is_followed_until_the_other_is_back(noisy):
     hidden = keypoints[:30].clone()
     hidden[:20, 1] = torch.nan
     poses = torchpose.BodyTracker(rig, "kalman", fps=FPS)(keypoints=hidden, names=NAMES)
+    spread = poses.details["covariance_from_pelvis"][:, LEGS].diagonal(dim1=-2, dim2=-1).sum((1, 2))
+    assert spread[0] > spread[-1]
     apart = relative(poses.joints3d) - relative(joints[poses.first_frame : 30])
     assert float(apart.norm(dim=-1).mean()) < 0.1
 

@@ -109,11 +109,9 @@ class OnlyCamera:
 
     def _from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
         """Return `covariance_from_pelvis` of some frames."""
-        _, jacobian = self.filter.articulation.linearise(poses.point)
-        apart = jacobian - jacobian[..., [_PELVIS], :, :]
-        lasting = self._unsure(poses, _guessed_from_pelvis(poses))
-        lasting[..., _PELVIS, :, :] = 0
-        return covariances_of(apart, poses.state_cov) + lasting
+        return relative_covariances(
+            self.filter, poses, self._unsure(poses, _guessed_from_pelvis(poses))
+        )
 
     def _unsure(
         self, poses: KeypointPoses, variances: Float[Tensor, "*batch J"]
@@ -121,6 +119,20 @@ class OnlyCamera:
         """Return the covariances of depths that the network does not tell, and `variances` each way."""
         depths = untold_depths(poses.joints - self.centre, poses.spread)
         return depths + variances[..., None, None] * torch.eye(3).to(depths)
+
+
+def relative_covariances(
+    filter: BodyKalmanFilter, poses: KeypointPoses, lasting: Float[Tensor, "*batch J 3 3"]
+) -> Float[Tensor, "*batch J 3 3"]:
+    """Return the covariances of joints relative to the pelvis by the state, and what lasts on top.
+
+    Args:
+        filter: whose poses they are. lasting: of joints relative to the pelvis; its own is left out.
+    """
+    _, jacobian = filter.articulation.linearise(poses.point)
+    apart = jacobian - jacobian[..., [_PELVIS], :, :]
+    lasting[..., _PELVIS, :, :] = 0
+    return covariances_of(apart, poses.state_cov) + lasting
 
 
 def untold_depths(

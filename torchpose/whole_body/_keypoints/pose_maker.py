@@ -9,18 +9,25 @@ better the larger the angle between their rays. With the mean c of their places,
 r_j from c to p_j, the covariance gets
 
     (s^2 (p_j - c) (p_j - c)^T + (1.25 s_j)^2 r_j r_j^T + s_l^2 I) / k^2.
+
+Relative to the pelvis p_0 they get the same with p_j - p_0 in place of p_j - c; k is 1 where one camera alone
+sees the person.
 """
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.body._skeleton import BODY_15
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, CorrectedBody
 from torchpose.whole_body._keypoints.body_size import outer
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.known_person import std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import telling
-from torchpose.whole_body._keypoints.only_camera import untold_depths
+from torchpose.whole_body._keypoints.nested import by_parts
+from torchpose.whole_body._keypoints.only_camera import relative_covariances, untold_depths
+
+_PELVIS = BODY_15.joint("pelvis")
 
 
 class PoseMaker:
@@ -87,7 +94,36 @@ class PoseMaker:
         """Return what one camera would not tell, as far as cameras side by side do not."""
         maps = self.filter.maps
         away = joints - maps.centre.mean(0)
-        size = std_of_legs(self.filter.motion) ** 2 * outer(away)
-        lone = self.lone_std**2 * torch.eye(3).to(joints)
-        untold = size + untold_depths(away, spread) + lone
-        return untold / telling(maps, joints)[..., None, None, None].square()
+        k = telling(maps, joints)
+        return self._untold_by_one(away, away, spread) / k[..., None, None, None].square()
+
+    def _untold_by_one(
+        self,
+        grown: Float[Tensor, "*batch J 3"],
+        away: Float[Tensor, "*batch J 3"],
+        spread: Float[Tensor, "*batch J"],
+    ) -> Float[Tensor, "*batch J 3 3"]:
+        """Return what one camera does not tell of joints.
+
+        Args:
+            grown: metres that joints move by if the log of the size grows by one. away: from the camera.
+            spread: as of `KeypointPoses`.
+        """
+        size = std_of_legs(self.filter.motion) ** 2 * outer(grown)
+        return size + untold_depths(away, spread) + self.lone_std**2 * torch.eye(3).to(away)
+
+    def covariance_from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
+        """Return the covariances of joints relative to the pelvis, whose own is zero; metres squared.
+
+        Args:
+            poses: of T frames, [T], in cameras side by side.
+        """
+        return by_parts(self._from_pelvis, poses, dim=0)
+
+    def _from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
+        """Return `covariance_from_pelvis` of some frames."""
+        joints, maps = poses.joints, self.filter.maps
+        apart, away = joints - joints[..., [_PELVIS], :], joints - maps.centre.mean(0)
+        k = torch.where(poses.alone >= 0, 1.0, telling(maps, joints))
+        untold = self._untold_by_one(apart, away, poses.spread)
+        return relative_covariances(self.filter, poses, untold / k[..., None, None, None].square())

@@ -39,7 +39,7 @@ KEYPOINT_METHOD = "kalman"
 CAMERA_TURN = "camera_turn"
 """Name of the detail of cameras that are turned, there where any is."""
 COVARIANCE_FROM_PELVIS = "covariance_from_pelvis"
-"""Name of the detail of one camera."""
+"""Name of the detail of one camera, or of cameras side by side."""
 
 
 class TrackBuilder:
@@ -69,8 +69,9 @@ class TrackBuilder:
         begun = 0 if live else int(poses.started[b].int().argmax())
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
         standing: dict[str, Tensor] = {}
-        if self.tracker.only is not None:
-            standing[COVARIANCE_FROM_PELVIS] = self.tracker.only.covariance_from_pelvis(poses)
+        of_depths = self.tracker.poses if self.tracker.poses.side_by_side else self.tracker.only
+        if of_depths is not None:
+            standing[COVARIANCE_FROM_PELVIS] = of_depths.covariance_from_pelvis(poses)
         if feet is not None:
             own = mapped(lambda value: value[b, begun:], feet)
             standing |= dict(zip(DETAILS_OF_FEET, own, strict=True))
