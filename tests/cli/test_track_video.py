@@ -12,6 +12,7 @@ import torch
 
 from torchpose import demo
 from torchpose.cli._common import UntilInterrupted
+from torchpose.cli._track_video import _notes_of_all
 from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
@@ -147,6 +148,33 @@ def test_several_persons_and_then_one(clip, track, tmp_path):
     assert {n for n in names if n.startswith("poses_")} == {*mine, "poses_p02.csv"}
     assert (out / "poses_p02.csv").read_text() == "edited"
     assert {name: (out / name).read_bytes() for name in mine} == mine
+
+
+def test_notes_of_all_persons_are_said_once_and_by_name_where_they_differ():
+    people = [
+        SimpleNamespace(track=SimpleNamespace(notes=notes))
+        for notes in (
+            ("a focal length", "1 outlier", "cuts"),
+            ("a focal length", "2 outliers", "cuts"),
+        )
+    ]
+    assert _notes_of_all(people, ["person 1", "person 2"]) == (
+        "a focal length", "cuts", "person 1: 1 outlier", "person 2: 2 outliers",
+    )  # fmt: skip
+
+
+def test_the_report_has_the_notes_of_the_track(tmp_path, clip, track):
+    path, _ = clip
+    twice = tmp_path / "twice.mp4"
+    with open_video(path) as source, VideoWriter(twice, 30.0, source.size) as writer:
+        shown = [frame.image for frame in source]
+        for frame in shown[:22] + [
+            np.ascontiguousarray(np.roll(one, 160, 1)) for one in shown[:22]
+        ]:
+            writer.write(frame)
+    done, out = track(twice)
+    note = "the video cuts to another scene at frame 22:"
+    assert note in done.out and note in (out / "report.html").read_text()
 
 
 @pytest.mark.parametrize("full_disk", [False, True])

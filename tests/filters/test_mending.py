@@ -5,7 +5,7 @@ import torch
 
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
 from torchpose.priors import GaussianMixture
-from torchpose.upper_body._estimator import mending_notes
+from torchpose.upper_body._estimator import joined_notes, mending_notes
 
 N_FRAMES = 5
 # Of rank one, in powers of two: pixels and radians whose factor breaks down at exactly zero.
@@ -103,3 +103,11 @@ def test_a_track_notes_what_was_mended_and_nothing_else():
     count = int(mask.all(-1).sum())
     assert note.startswith(f"{count} covariances were not positive definite in rounding")
     assert "at most 1e-14" in note
+
+
+def test_notes_of_parts_are_those_of_the_whole():
+    said = "covariances were not positive definite in rounding and were mended: their variances grew by"
+    few, more = f"2 {said} at most 1e-14 of themselves", f"3 {said} at most 2e-09 of themselves"
+    assert joined_notes(["a", few, "b", few, "a", more]) == (
+        "a", "b", f"7 {said} at most 2e-09 of themselves",
+    )  # fmt: skip

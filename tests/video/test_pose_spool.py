@@ -87,3 +87,10 @@ def test_outliers_of_all_blocks_are_in_one_note():
     assert note == "a note"
     assert found.startswith("3 keypoints taken as outliers") and "head 3; " in found
     assert found.endswith("exchanged back in 6 frames")
+
+
+def test_notes_of_later_blocks_are_kept_and_said_once():
+    spool = PoseSpool()
+    for notes in ((), ("a note",), ("another",), ("a note",)):
+        spool.append(replace(poses(4), notes=notes))
+    assert spool.track().notes == ("a note", "another")

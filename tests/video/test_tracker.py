@@ -162,6 +162,8 @@ def test_all_begins_anew_before_a_camera(prior, one_person):
         state, people = tracker.step(state, frame)
         counts.append(len(people))
     assert counts[5] == 1 and counts[6] == 0 and counts[-1] == 1
+    assert (state.n_frames, state.cuts) == (12, (6,))
+    assert any("another scene at frame 6:" in note for note in people[0].pose.notes)
     torch.testing.assert_close(
         people[0].pose.joints3d, live_poses(tracker, aside)[-1:], rtol=0, atol=1e-9
     )

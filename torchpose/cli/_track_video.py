@@ -85,12 +85,13 @@ def track_video(
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         names = _names(people, source.reopenable)
+        notes = _notes_of_all(people, names)
         written = _write_poses(people, source, n_frames, results, pictures, overlay)
         if overlay:
             title = Path(job.input).name
             shown = _write_report(results.stage, people, names, n_frames, facts, notes, title)
             written += results.commit(shown)
-    print(_summary(people, names, written, facts, results.notes))
+    print(_summary(people, names, written, facts, (*notes, *results.notes)))
     return max(report_failure(person.track) for person in people)
 
 
@@ -320,6 +321,21 @@ def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
     return written
 
 
+def _notes_of_all(people: list["TrackedPerson"], names: list[str]) -> tuple[str, ...]:
+    """Return the notes of all persons, each once; the name comes first where not all have a note."""
+    own = [person.track.notes for person in people]
+    common = [note for note in own[0] if all(note in notes for notes in own)]
+    return (
+        *common,
+        *(
+            f"{name}: {note}"
+            for name, notes in zip(names, own, strict=True)
+            for note in notes
+            if note not in common
+        ),
+    )
+
+
 def _write_report(
     out: Path,
     people: list["TrackedPerson"],
@@ -392,7 +408,7 @@ def _summary(
     notes: Sequence[str],
 ) -> str:
     """Return the summary that is printed: the persons, and the poses of the first."""
-    first = summary(people[0].track, written, facts, notes)
+    first = summary(replace(people[0].track, notes=()), written, facts, notes)
     if len(people) == 1:
         return first
     others = [

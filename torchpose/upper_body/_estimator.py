@@ -1,5 +1,6 @@
 """Define the interface of the estimators: measured joints in, the states of both arms out."""
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -390,10 +391,31 @@ def mending_notes(left: FilterOutput, right: FilterOutput) -> tuple[str, ...]:
     if not count:
         return ()
     most = max(float(out.jitter.max()) for out in outputs if out.jitter is not None)
+    return (_mending_note(count, most),)
+
+
+def _mending_note(count: int, most: float) -> str:
     return (
         f"{count} covariances were not positive definite in rounding and were mended: their "
-        f"variances grew by at most {most:.0e} of themselves",
+        f"variances grew by at most {most:.0e} of themselves"
     )
+
+
+_MENDED = re.compile(r"(\d+) covariances were not positive definite .* at most (\S+) of themselves")
+
+
+def joined_notes(notes: Iterable[str]) -> tuple[str, ...]:
+    """Return the notes of all parts of a sequence, each once, and one on all covariances that were mended."""
+    mended, others = [], []
+    for note in notes:
+        match = _MENDED.fullmatch(note)
+        mended += [match] if match else []
+        others += [] if match else [note]
+    once = tuple(dict.fromkeys(others))
+    if not mended:
+        return once
+    count, most = sum(int(match[1]) for match in mended), max(float(match[2]) for match in mended)
+    return (*once, _mending_note(count, most))
 
 
 def require_cov(out: FilterOutput | StepOutput) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpose._core.facade import set_up_facade
 from torchpose._core.wording import numbered_frames
 from torchpose.errors import InputError, OutputError
+from torchpose.upper_body._estimator import joined_notes
 from torchpose.upper_body._outlier_notes import (
     exchanged_frames,
     outlier_notes,
@@ -58,6 +59,7 @@ class PoseSpool:
         self._like: PoseTrack | None = None
         self._n_frames = 0
         self._exchanged = 0
+        self._notes: tuple[str, ...] = ()
         self.failed_at = -1
 
     def __len__(self) -> int:
@@ -82,6 +84,7 @@ class PoseSpool:
         if self.failed_at < 0 <= int(block.failed_at[0]):
             self.failed_at = self._n_frames + int(block.failed_at[0])
         self._exchanged += exchanged_frames(block.notes)
+        self._notes = joined_notes((*self._notes, *without_outliers(block.notes)))
         self._like = block if self._like is None else self._like
         self._n_frames += block.joints3d.shape[1]
 
@@ -102,8 +105,8 @@ class PoseSpool:
             fields[name] = torch.from_numpy(stored[:count])[None]
         fields["lengths"] = torch.tensor([count])
         fields["failed_at"] = torch.tensor([self.failed_at])
-        fields["notes"] = without_outliers(like.notes)
-        fields["notes"] += outlier_notes(fields["inlier_probability"], self._exchanged)
+        found = outlier_notes(fields["inlier_probability"], self._exchanged)
+        fields["notes"] = (*self._notes, *found)
         return note_collapse(replace(like, **fields))
 
     def _path(self, name: str) -> Path:
@@ -173,22 +176,16 @@ class TrackedRecording:
         self.tracker, self.names, self.gap, self.folder = tracker, tuple(names), gap, folder
         self.n_frames = 0
         self._people: dict[int, _Person] = {}
-        self._cuts: list[int] = []
 
-    def append(
-        self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int, cut: bool = False
-    ) -> None:
+    def append(self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int) -> None:
         """Keep the poses of the next block.
 
         Args:
             tracked: the parts of the block with poses, by person. n_frames: the length of the block.
-            cut: whether another scene begins with the block.
 
         Raises:
             OutputError: the disk is full.
         """
-        if cut:
-            self._cuts.append(self.n_frames)
         for number, parts in tracked.items():
             for part in parts:
                 self._keep(number, part)
@@ -213,18 +210,23 @@ class TrackedRecording:
             person.last_seen = place + int(seen[-1])
             person.n_seen += len(seen)
 
-    def finish(self, smoother: UpperBodyTracker | None = None) -> list[TrackedPerson]:
+    def finish(
+        self, smoother: UpperBodyTracker | None = None, cuts: Sequence[int] = ()
+    ) -> list[TrackedPerson]:
         """Return the persons who were seen for half a second or longer, the longest seen first.
 
         Args:
             smoother: the smoother of whole recordings; None keeps the filtered poses.
+            cuts: the frames that begin another scene.
         """
         least = _LEAST_SECONDS * (self.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
         lasting.sort(key=lambda person: -person.n_seen)
-        return [self._finish(person, smoother) for person in lasting]
+        return [self._finish(person, smoother, cuts) for person in lasting]
 
-    def _finish(self, person: _Person, smoother: UpperBodyTracker | None) -> TrackedPerson:
+    def _finish(
+        self, person: _Person, smoother: UpperBodyTracker | None, cuts: Sequence[int]
+    ) -> TrackedPerson:
         """Return the poses until the person was last seen."""
         count = person.last_seen + 1
         fields = (_joined(parts, count) for parts in zip(*person.measured, strict=True))
@@ -236,17 +238,16 @@ class TrackedRecording:
         track = (
             found.track
             if smoother is None
-            else self._smoothed(measured, person.first_frame, smoother)
+            else self._smoothed(measured, smoother, [cut - person.first_frame for cut in cuts])
         )
-        notes = track.notes + _note_on_cuts(self._cuts)
-        return replace(found, track=replace(track, first_frame=person.first_frame, notes=notes))
+        track = with_note_on_cuts(track, cuts)
+        return replace(found, track=replace(track, first_frame=person.first_frame))
 
     def _smoothed(
-        self, measured: Measured, first_frame: int, smoother: UpperBodyTracker
+        self, measured: Measured, smoother: UpperBodyTracker, cuts: Sequence[int]
     ) -> PoseTrack:
         """Return the smoothed poses of a person: of each scene from the measurements in it."""
         seen, end = measured.seen, len(measured.keypoints)
-        cuts = [cut - first_frame for cut in self._cuts]
         bounds = [0, *(cut for cut in cuts if 0 < cut < end), end]
         poses = PoseSpool(self.folder)
         for start, stop in pairwise(bounds):
@@ -284,13 +285,15 @@ def smoothed(
     return without_long_gaps(track, seen, 0, gap)
 
 
-def _note_on_cuts(cuts: Sequence[int]) -> tuple[str, ...]:
+def with_note_on_cuts(track: PoseTrack, cuts: Sequence[int]) -> PoseTrack:
+    """Return the track with a note on the frames at which the video cuts to another scene, if any."""
     if not cuts:
-        return ()
-    return (
+        return track
+    note = (
         f"the video cuts to another scene at {numbered_frames(cuts)}: everybody is found anew there, and "
-        "recognised by the clothes",
+        "recognised by the clothes"
     )
+    return replace(track, notes=(*track.notes, note))
 
 
 def _joined(parts: Sequence[Tensor | None], count: int) -> Tensor | None:

@@ -57,7 +57,7 @@ from torchpose.video._person_stream import (
     TrackedBlock,
 )
 from torchpose.video._prefetch import prefetch
-from torchpose.video._recording import TrackedPerson, TrackedRecording
+from torchpose.video._recording import TrackedPerson, TrackedRecording, with_note_on_cuts
 from torchpose.video._source_interface import VideoFrame
 
 Watcher = Callable[[Image, Found, dict[int, PoseTrack]], None]
@@ -74,11 +74,14 @@ class VideoState(NamedTuple):
     Attributes:
         measurer: the state of the measurer. streams: the states of the persons by number.
         poses: the last poses of the persons in `streams`, without those of filters that degenerated.
+        n_frames: the number of frames so far. cuts: those of them that begin another scene.
     """
 
     measurer: MeasurerState | KeypointState
     streams: dict[int, PersonStreamState]
     poses: dict[int, PoseTrack]
+    n_frames: int = 0
+    cuts: tuple[int, ...] = ()
 
 
 class LivePerson(NamedTuple):
@@ -87,7 +90,7 @@ class LivePerson(NamedTuple):
     Attributes:
         number: the number of the person, in the order of appearance.
         pose: a track of one frame; `pose.failed` [1] says whether the filter degenerated, as in a
-            `PoseTrack` and a `LivePose`.
+            `PoseTrack` and a `LivePose`. `pose.notes` name the frames that begin another scene.
         measured: the measurements in the frame.
     """
 
@@ -256,7 +259,10 @@ class VideoTracker(nn.Module):
         """
         state, tracked = self.advance(state, [image])
         last = {number: tracked[number][-1].last() for number in state.streams}
-        return state, [LivePerson(n, part.poses, part.measured) for n, part in last.items()]
+        return state, [
+            LivePerson(n, with_note_on_cuts(part.poses, state.cuts), part.measured)
+            for n, part in last.items()
+        ]
 
     @uncompiled
     def advance(
@@ -315,6 +321,7 @@ class VideoTracker(nn.Module):
         """
         recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
         start, size = self.init(), _BLOCK if watch is None else 1
+        state = start
         images = self._images(frames)
         ahead = prefetch(look_ahead(self._measurer, start.measurer, images))
         with (
@@ -323,12 +330,12 @@ class VideoTracker(nn.Module):
             tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
         ):
             for state, block, tracked in blocks:
-                recording.append(tracked, len(block.found), block.cut)
+                recording.append(tracked, len(block.found))
                 bar.update(len(block.found))
                 if watch is not None:
                     for _ in block.found:
                         watch(block.images[-1], block.found[-1], dict(state.poses))
-        return recording.finish(self.smoother)
+        return recording.finish(self.smoother, state.cuts)
 
     if TYPE_CHECKING:  # nn.Module has Any
         __call__ = forward
@@ -384,7 +391,8 @@ class VideoTracker(nn.Module):
         streams, tracked = self.stream.advance_all(before, found, images, self.gap)
         last = {number: tracked[number][-1].poses for number in streams}
         poses = {number: pose for number, pose in last.items() if _ends_in_pose(pose)}
-        return VideoState(own, streams, poses), tracked
+        cuts = (*state.cuts, state.n_frames) if cut else state.cuts
+        return VideoState(own, streams, poses, state.n_frames + len(found), cuts), tracked
 
 
 def _keypoint_measurer(
