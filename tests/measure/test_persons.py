@@ -10,6 +10,7 @@ from torchpose.measure._persons import PersonRegister, clothes_colours, largest_
 from torchpose.measure._upper_body_measurer import UpperBodyMeasurer
 
 RED, BLUE, GREEN = (200, 30, 40), (20, 40, 180), (40, 160, 60)
+DARK_RED = (150, 60, 70)  # too much like red for another scene
 
 
 def scene(*people):
@@ -147,6 +148,42 @@ def test_who_leaves_the_image_is_not_measured_beyond_its_border():
         places += view.faces[:, 0].tolist()
     assert 600 < max(places) < 640, "it is measured until it has left, and not any longer"
     assert float(seen.faces.mean[0, 0]) > 640
+
+
+@pytest.mark.parametrize(
+    ("end", "clothed", "most"),
+    [(320, True, 30), (320, False, 4), (605, True, 4)],
+    ids=["turned away", "hidden", "at the border"],
+)
+def test_a_lost_face_counts_while_the_person_is_still_to_be_seen(end, clothed, most):
+    """One who walks to x = `end`, whose face is not found from there on."""
+    found = torch.zeros(0, 3, dtype=torch.float64)
+    measurer = UpperBodyMeasurer(
+        load_prior("kinect-upper-body-small"), hands="mean-shift", face_detector=lambda *_: found
+    )
+    seen, counts = measurer.init().seen, []
+    for t in range(80):
+        x, there = min(end, end - 3 * (40 - t)), t <= 40
+        found = torch.tensor([[x, 50.0, 80.0]][:there], dtype=torch.float64).reshape(-1, 3)
+        image = np.full((240, 640, 3), 128, np.uint8)
+        image[120:, x - 80 : x + 80] = RED if there or clothed else DARK_RED
+        view = measurer.look(seen, image)
+        seen = view.after
+        counts.append(len(view.number))
+    assert all(counts[3:40]) and sum(counts[41:]) == most
+
+
+def test_clothes_that_cannot_be_seen_are_no_reason_to_doubt():
+    register = PersonRegister()
+    image, faces = scene((100, RED), (400, BLUE))
+    identity = torch.tensor([4, 7])
+    persons, _ = register.step(register.init(), image, faces, identity, 0)
+    assert register.recognises(persons, image, faces, identity).tolist() == [True, True]
+    assert register.recognises(persons, image, faces.flip(0), identity).tolist() == [False, False]
+    below = faces + torch.tensor([0.0, 180.0, 0.0])  # the border of the image cuts the clothes off
+    assert register.recognises(persons, image, below, identity).tolist() == [True, True]
+    nobody_yet = torch.tensor([8, 9])
+    assert register.recognises(persons, image, faces, nobody_yet).tolist() == [True, True]
 
 
 def test_bad_settings_are_refused():

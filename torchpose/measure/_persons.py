@@ -145,6 +145,24 @@ class PersonRegister(nn.Module):
         nobody = torch.zeros(0, dtype=torch.long)
         return Persons(nobody, torch.zeros(0, _BINS**3, dtype=torch.float64), nobody.clone())
 
+    def recognises(
+        self,
+        persons: Persons,
+        image: Image,
+        faces: Float[Tensor, "N 3"],
+        identity: Int[Tensor, " N"],
+    ) -> Bool[Tensor, " N"]:
+        """Return whether the clothes below faces are those of their persons, or cannot be seen.
+
+        Args:
+            image: RGB. faces: (x, y, size), pixels. identity: of the faces.
+        """
+        colours = clothes_colours(image, faces)
+        owner = match_rows(persons.face, identity)
+        known = torch.nn.functional.pad(persons.colours, (0, 0, 0, 1))[owner]
+        unseen = (colours.sum(1) == 0) | (known.sum(1) == 0)
+        return unseen | ((known * colours).sqrt().sum(1) >= self.likeness)
+
     def step(
         self,
         persons: Persons,

@@ -224,8 +224,7 @@ class UpperBodyMeasurer(nn.Module):
             self._forget_background()
             seen = seen._replace(faces=self.face_tracker.begin_anew(seen.faces))
         tracks = self._follow_faces(seen.faces, image)
-        faces, face_cov, identity, unseen = self._used(tracks, image)
-        detected = unseen <= 2 * self.face_tracker.every
+        faces, face_cov, identity, detected = self._used(tracks, seen.persons, image)
         persons, number = self.register.step(
             seen.persons, image, faces, identity, seen.frame, detected
         )
@@ -344,18 +343,28 @@ class UpperBodyMeasurer(nn.Module):
         found = elbows_from_torso(clothes_likelihood(model, skin, bins), shrunk)
         return Elbows((found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen)
 
-    def _used(self, tracks: FaceTracks, image: Image) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen.
+    def _used(
+        self, tracks: FaceTracks, persons: Persons, image: Image
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the faces in use, pixels of the frame, covariances, identities, whether detected lately.
 
-        A face that has left the image is not measured there any more.
+        A face that is not detected any more is taken to be turned away or covered, unless the border of the
+        image cuts it or the clothes below are not there any more: then the person has left, or is hidden.
         """
-        scale, at = _face_scale(image), tracks.mean[:, :2]
+        scale, at, half = _face_scale(image), tracks.mean[:, :2], tracks.mean[:, 2:3] / 2
+        end = scale * at.new_tensor([image.shape[1], image.shape[0]])
+        detected = tracks.unseen <= 2 * self.face_tracker.every
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
-        used &= ((at >= 0) & (at < scale * at.new_tensor([image.shape[1], image.shape[0]]))).all(-1)
+        used &= ((at >= 0) & (at < end)).all(-1)
+        used &= detected | ((at >= half) & (at < end - half)).all(-1)
+        lost = torch.nonzero(used & ~detected).flatten()
+        if len(lost):
+            where = scaled_back(tracks.mean[lost, :3], scale)
+            used[lost] = self.register.recognises(persons, image, where, tracks.identity[lost])
         rows = torch.nonzero(used).flatten()
         faces = scaled_back(tracks.mean[rows, :3], scale)
         cov = tracks.cov[rows, :3, :3] / scale**2
-        return faces, cov, tracks.identity[rows], tracks.unseen[rows]
+        return faces, cov, tracks.identity[rows], detected[rows]
 
 
 def _expected(
