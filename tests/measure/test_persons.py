@@ -183,7 +183,19 @@ def test_clothes_that_cannot_be_seen_are_no_reason_to_doubt():
     below = faces + torch.tensor([0.0, 180.0, 0.0])  # the border of the image cuts the clothes off
     assert register.recognises(persons, image, below, identity).tolist() == [True, True]
     nobody_yet = torch.tensor([8, 9])
-    assert register.recognises(persons, image, faces, nobody_yet).tolist() == [True, True]
+    assert register.recognises(persons, image, faces, nobody_yet).tolist() == [False, False]
+
+
+def test_who_is_found_elsewhere_while_the_face_is_lost_is_no_second_person():
+    """One who is hidden by somebody in the same clothes, and comes out on the other side."""
+    register, state = PersonRegister(), PersonRegister().init()
+    image, faces = scene((100, RED), (300, RED), (500, RED))
+    identity = torch.tensor([0, 1, 2])
+    state, both = register.step(state, image, faces[:2], identity[:2], 0)
+    detected = torch.tensor([False, True, True])
+    state, number = register.step(state, image, faces, identity, 1, detected, ~detected)
+    assert (both.tolist(), number.tolist(), state.face.tolist()) == ([0, 1], [0, 1, 0], [2, 1])
+    assert register.recognises(state, image, faces, identity).tolist() == [False, True, True]
 
 
 def test_bad_settings_are_refused():

@@ -154,6 +154,9 @@ class PersonRegister(nn.Module):
     ) -> Bool[Tensor, " N"]:
         """Return whether the clothes below faces are those of their persons, or cannot be seen.
 
+        A face whose person has got another one is not recognised.
+
+
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the faces.
         """
@@ -161,7 +164,8 @@ class PersonRegister(nn.Module):
         owner = match_rows(persons.face, identity)
         known = torch.nn.functional.pad(persons.colours, (0, 0, 0, 1))[owner]
         unseen = (colours.sum(1) == 0) | (known.sum(1) == 0)
-        return unseen | ((known * colours).sqrt().sum(1) >= self.likeness)
+        alike = unseen | ((known * colours).sqrt().sum(1) >= self.likeness)
+        return alike & (owner < len(persons.face))
 
     def step(
         self,
@@ -171,19 +175,25 @@ class PersonRegister(nn.Module):
         identity: Int[Tensor, " N"],
         frame: int,
         detected: Bool[Tensor, " N"] | None = None,
+        lost: Bool[Tensor, " N"] | None = None,
     ) -> tuple[Persons, Int[Tensor, " N"]]:
         """Return the next state, and the number of the person of each face.
+
+        A newcomer may be a person in the same clothes whose face is lost. Then two faces have that number,
+        and the newcomer's is the one in `Persons.face`.
 
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the tracked faces. frame: number.
             detected: False where a face has not been detected lately and its place is predicted: the
                 clothes below it are not learnt. None means all are detected.
+            lost: True where a face may be found elsewhere, as that of a newcomer. None means nowhere.
         """
         colours = clothes_colours(image, faces)
         owner = match_rows(persons.face, identity)
         owner = torch.where(owner < len(persons.face), owner, -1)
         for row in torch.nonzero(owner < 0).flatten().tolist():  # newcomers, seldom any
-            persons, owner[row] = self._admit(persons, colours[row], identity, owner, row, frame)
+            followed = owner[owner >= 0 if lost is None else (owner >= 0) & ~lost]
+            persons, owner[row] = self._admit(persons, colours[row], identity[row], followed, frame)
         known = persons.colours.clone()
         rate = _LEARNING if detected is None else _LEARNING * detected.to(colours)[:, None]
         known[owner] += rate * (colours - known[owner])
@@ -196,19 +206,19 @@ class PersonRegister(nn.Module):
         persons: Persons,
         colours: Tensor,
         identity: Tensor,
-        owner: Tensor,
-        row: int,
+        followed: Tensor,
         frame: int,
     ) -> tuple[Persons, int]:
+        """Return the next state and the number of a newcomer, who is none of those `followed` already."""
         alike = (persons.colours * colours).sqrt().sum(1)
-        away = ~torch.isin(persons.face, identity) & (frame - persons.last_seen <= self.within)
-        away[owner[owner >= 0]] = False
+        away = frame - persons.last_seen <= self.within
+        away[followed] = False
         alike = torch.where(away & (alike >= self.likeness), alike, -torch.ones_like(alike))
         if len(alike) and float(alike.max()) > 0:
             number = int(alike.argmax())
             face = persons.face.clone()
-            face[number] = identity[row]
+            face[number] = identity
             return persons._replace(face=face), number
-        face = torch.cat([persons.face, identity[row : row + 1]])
+        face = torch.cat([persons.face, identity[None]])
         last_seen = torch.cat([persons.last_seen, persons.last_seen.new_tensor([frame])])
         return Persons(face, torch.cat([persons.colours, colours[None]]), last_seen), len(face) - 1

@@ -226,8 +226,12 @@ class UpperBodyMeasurer(nn.Module):
         tracks = self._follow_faces(seen.faces, image)
         faces, face_cov, identity, detected = self._used(tracks, seen.persons, image)
         persons, number = self.register.step(
-            seen.persons, image, faces, identity, seen.frame, detected
+            seen.persons, image, faces, identity, seen.frame, detected, ~detected
         )
+        own = (
+            persons.face[number] == identity
+        )  # others are predicted faces of who is found elsewhere
+        faces, face_cov, number = faces[own], face_cov[own], number[own]
         if self.max_persons is not None:
             rows = largest_persons(number, faces[:, 2], seen.followed, self.max_persons)
             faces, face_cov, number = faces[rows], face_cov[rows], number[rows]
