@@ -108,6 +108,15 @@ def test_a_video_without_a_face_has_no_poses(track, tmp_path):
     assert not list(out.iterdir()) and "turned" not in done.out
 
 
+def test_a_video_that_is_too_short_is_said_to_be(track, tmp_path):
+    with VideoWriter(tmp_path / "short.mp4", 30.0, (160, 120)) as writer:
+        for _ in range(5):
+            writer.write(np.full((120, 160, 3), 90, np.uint8))
+    done, _ = track(tmp_path / "short.mp4")
+    assert done.code == 1
+    assert "short.mp4 has 5 frames (0.17 s), too few for poses" in done.err
+
+
 @pytest.mark.parametrize("turns", [1, 2])
 def test_a_video_on_its_side_is_said_to_be(clip, track, tmp_path, turns):
     side = tmp_path / "side.mp4"

@@ -379,10 +379,20 @@ def _nobody(
     detector: str | None,
 ) -> int:
     """Print that there is no pose and the reason; return the exit code."""
+    from torchpose.video._recording import LEAST_SECONDS
+
     if (out / "poses.npz").exists():
         notes += (f"{out / 'poses.npz'} is of an earlier run",)
     for note in notes:
         print(f"note     {note}")
+    length = f"{counted(n_frames, 'frame')} ({n_frames / fps:.2g} s)"
+    if n_frames < LEAST_SECONDS * fps:
+        print(
+            f"torchpose: {where} has {length}, too few for poses: persons count who are seen for half a "
+            "second or longer",
+            file=sys.stderr,
+        )
+        return 1
     if detector is None:
         what = "face"
         wants = (
@@ -393,8 +403,8 @@ def _nobody(
         what = "person"
         wants = f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
     print(
-        f"torchpose: no {what} was seen for half a second or longer in the {counted(n_frames, 'frame')} "
-        f"({n_frames / fps:.2g} s) of {where}, so there are no poses. {wants}",
+        f"torchpose: no {what} was seen for half a second or longer in the {length} of {where}, "
+        f"so there are no poses. {wants}",
         file=sys.stderr,
     )
     return 1

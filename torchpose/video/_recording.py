@@ -33,7 +33,7 @@ from torchpose.video._person_stream import (
     without_long_gaps,
 )
 
-_LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
+LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
 
 
 class PoseSpool:
@@ -219,7 +219,7 @@ class TrackedRecording:
             smoother: the smoother of whole recordings; None keeps the filtered poses.
             cuts: the frames that begin another scene.
         """
-        least = _LEAST_SECONDS * (self.tracker.fps or 30.0)
+        least = LEAST_SECONDS * (self.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
         lasting.sort(key=lambda person: -person.n_seen)
         return [self._finish(person, smoother, cuts) for person in lasting]
