@@ -42,9 +42,20 @@ def test_joined_scenes_are_cut_where_they_were_joined():
 
 
 def test_somebody_else_in_the_same_place_is_another_scene():
+    one, other = two_in_one_place()
+    assert cuts([one] * 10 + [other] * 10) == [10]
+
+
+def test_scenes_may_be_short():
+    one, other = two_in_one_place()
+    assert cuts(([one] * 8 + [other] * 8) * 3) == [8, 16, 24, 32, 40]
+
+
+def two_in_one_place():
+    """Return pictures of two persons before the same background."""
     one, other = scene(0), scene(0)
     one[20:, 40:125], other[20:, 40:125] = scene(3)[20:, 40:125], scene(4)[20:, 40:125]
-    assert cuts([one] * 10 + [other] * 10) == [10]
+    return one, other
 
 
 def test_black_ends_a_scene_once():

@@ -21,10 +21,16 @@ Pattern = NDArray[np.float32]
 
 
 class SceneState(NamedTuple):
-    """Holds the pattern of the last frame, None before the first, and the change that is usual."""
+    """Holds what is known after a frame.
+
+    Attributes:
+        pattern: of the last frame, None before the first. usual: the change that is usual.
+        cut: the change at the last frame if that is the first of another scene, else 0.
+    """
 
     pattern: Pattern | None
     usual: float
+    cut: float = 0.0
 
 
 class SceneCuts:
@@ -37,7 +43,8 @@ class SceneCuts:
         change_t = 1 - max_s c(pattern_t, pattern_{t-1} shifted by s)
 
     A frame is the first of another scene if its change exceeds four times the largest one of the last
-    moments, bounded to 0.4 to 0.65, and one and a half times that one, which noise in the dark does not.
+    moments, bounded to 0.4 to 0.65, and one and a half times that one, which noise in the dark does not. The
+    change of a cut counts among these in the next frame alone, so that scenes may be short.
     An image that shows nothing, such as black ones between scenes, ends a scene as well; the next one
     begins unnoticed, since nothing is known then.
 
@@ -59,9 +66,10 @@ class SceneCuts:
             return SceneState(pattern, 0.0), False
         if _is_blank(pattern):
             return SceneState(pattern, 0.0), True
-        change, usual = _change(before, pattern), state.usual
-        cut = change > max(min(max(_TIMES * usual, _LEAST), _CLEAR), _ALWAYS * usual)
-        return SceneState(pattern, max(change, self._decay * usual)), cut
+        change, usual = _change(before, pattern), max(state.usual, state.cut)
+        if change > max(min(max(_TIMES * usual, _LEAST), _CLEAR), _ALWAYS * usual):
+            return SceneState(pattern, self._decay * state.usual, change), True
+        return SceneState(pattern, max(change, self._decay * state.usual)), False
 
 
 def _pattern(image: Image) -> Pattern:
