@@ -156,7 +156,6 @@ class PersonRegister(nn.Module):
 
         A face whose person has got another one is not recognised.
 
-
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the faces.
         """
