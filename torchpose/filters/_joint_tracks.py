@@ -5,8 +5,8 @@ a step is two products of that width, the rows of the measured dimensions, and o
 
 A <- [F, 0; 0, 1] A [F, 0; 0, 1]^T + [N, b; b^T, 0],   W = L^-1 [H P, H x - z],   A <- A - W^T W,
 
-with L L^T = H P H^T + R; the last column of W is minus the whitened innovation, and c then
-minus the square of that. The measured dimensions come first, so that H P is a slice.
+with L L^T = H P H^T + R; the last column of W is minus the whitened innovation, and c loses the square
+of that. The measured dimensions come first, so that H P is a slice.
 """
 
 import itertools
@@ -39,7 +39,7 @@ _LOGS = 16  # standard deviations whose product is within range, and costs one l
 
 
 class JointModel(NamedTuple):
-    """Holds the prediction by every component: [F, 0; 0, 1] and [N, b; b^T, 0], both [K, E, E]."""
+    """Holds the prediction by every component: [F, 0; 0, 1]^T and [N, b; b^T, 0], both [K, E, E]."""
 
     matrix: Tensor
     noise: Tensor
@@ -49,8 +49,8 @@ class JointProblem(NamedTuple):
     """Holds what is measured in one frame by B elements.
 
     Attributes:
-        z: [B, 1, Z], 0 where missing. noise, both: of `FrameNoise` [B, 1, Z, Z]. mask:
-            [B, 1, Z, 1]. log_norm: constant of the likelihood [B, 1].
+        z: [B, 1, Z], 0 where missing. noise, both: of `FrameNoise` [B, 1, Z, Z]; noise that all elements
+            share is [1, 1, Z, Z]. mask: [B, 1, Z, 1]. log_norm: constant of the likelihood [B, 1].
     """
 
     z: Tensor
@@ -93,7 +93,7 @@ def joint_model(model: MixtureKalmanFilter, time: int) -> JointModel:
         spare = spare_columns(model.dim) - 1
         joint = pad(torch.cat([noise, offset[..., None]], -1), (0, spare, 0, spare + 1))
         joint[:, model.dim, : model.dim] = offset
-        square = pad(matrix, (0, spare + 1, 0, spare + 1))
+        square = pad(matrix.mT, (0, spare + 1, 0, spare + 1))
         square[:, model.dim, model.dim] = 1
         return JointModel(square, joint)
 
@@ -110,6 +110,8 @@ def joint_problems(frames: Measurements) -> list[JointProblem]:
     """Return what is measured in every frame, for `JointTracks.correct`."""
     cov = frames.cov[None, None] if frames.cov.ndim == 2 else frames.cov
     noise, both, mask, log_norm = frame_noise(cov, frames.mask)
+    if frames.cov.ndim == 2 and both is None:
+        noise = noise[:1]
     n_frames = frames.z.shape[1]
     gaps = [None] * n_frames if both is None else both[:, :, None].unbind(1)
     parts = frames.z[:, :, None].to(noise), noise[:, :, None], mask[:, :, None, :, None], log_norm
@@ -125,13 +127,14 @@ class _Room:
 
     Attributes:
         flat: one after the other [B M, E, E]. rows, block: H P and H P H^T, beside H x.
-        mean: [B, M, D]. corner: c [B, M].
+        mean: [B, M, D]. cov: [B, M, D, D]. corner: c [B, M].
     """
 
     def __init__(self, state: Tensor, dim: int, n_observed: int) -> None:
         self.state, self.flat = state, state.flatten(0, 1)
         self.rows, self.block = state[..., :n_observed, :], state[..., :n_observed, :n_observed]
         self.mean, self.corner = state[..., :dim, dim], state[..., dim, dim]
+        self.cov = state[..., :dim, :dim]
 
 
 class JointTracks:
@@ -139,6 +142,9 @@ class JointTracks:
 
     Args:
         model: the filter. mean: [B, M, D]. cov: [B, M, D, D].
+
+    Attributes:
+        back: the place of every dimension of the filter's state among those of a track, [D].
     """
 
     def __init__(
@@ -147,7 +153,7 @@ class JointTracks:
         mean: Float[Tensor, "B M D"],
         cov: Float[Tensor, "B M D D"],
     ) -> None:
-        order, self._back = joint_order(model)
+        order, self.back = joint_order(model)
         mean, cov = mean[..., order], cov[..., order[:, None], order]
         self.dim, self.n_observed = model.dim, len(model.observed)
         width = self.dim + spare_columns(self.dim)
@@ -161,7 +167,7 @@ class JointTracks:
         """Allocate the memory that every step uses again."""
         sizes = self.dim, self.n_observed
         self._now, self._other = _Room(state, *sizes), _Room(torch.empty_like(state), *sizes)
-        self._matrix, self._moved = (torch.empty_like(self._now.flat) for _ in range(2))
+        self._matrix = torch.empty_like(self._now.flat)
         self._measured = state.new_empty(self._now.rows.shape)
         self._innovation = self._measured[..., self.dim]
         self._first = state.shape[1] * torch.arange(len(state), device=state.device)[:, None]
@@ -174,12 +180,17 @@ class JointTracks:
     @property
     def mean(self) -> Float[Tensor, "B M D"]:
         """Return the means, in the order of the filter's state."""
-        return self._now.mean.index_select(-1, self._back)
+        return self._now.mean[..., self.back]
 
     @property
     def cov(self) -> Float[Tensor, "B M D D"]:
         """Return the covariances, in the order of the filter's state."""
-        return self.state[..., self._back[:, None], self._back]
+        return self.state[..., self.back[:, None], self.back]
+
+    @property
+    def moments(self) -> tuple[Float[Tensor, "B M D"], Float[Tensor, "B M D D"]]:
+        """Return views of the means and covariances, in the order of the tracks."""
+        return self._now.mean, self._now.cov
 
     def take(self, parent: Int[Tensor, "B M"]) -> None:
         """Replace the tracks of every element by some of them, of which some may be taken again."""
@@ -192,21 +203,30 @@ class JointTracks:
 
     def predict(self, model: JointModel, component: Int[Tensor, "B M"]) -> None:
         """Predict the tracks by a component each (BL 34, 37)."""
-        chosen, predicted = component.flatten(), self._other.flat
+        chosen, tracks, moved = component.flatten(), self._now.flat, self._other.flat
         torch.index_select(model.matrix, 0, chosen, out=self._matrix)
-        torch.bmm(self._matrix, self._now.flat, out=self._moved)
-        torch.index_select(model.noise, 0, chosen, out=predicted)
-        predicted.baddbmm_(self._moved, self._matrix.mT)
-        self._now, self._other = self._other, self._now
+        # A F^T, then F (A F^T): products with F^T on the right would take a quarter longer
+        torch.bmm(tracks, self._matrix, out=moved)
+        torch.index_select(model.noise, 0, chosen, out=tracks)
+        tracks.baddbmm_(self._matrix.mT, moved)
 
-    def correct(
+    def correct(self, problem: JointProblem) -> Float[Tensor, "B M"] | None:
+        """Update the tracks by a measurement (BL 38-41), and return the jitter of `mended_cholesky`."""
+        return self._correct(problem)[1]
+
+    def weigh(
         self, problem: JointProblem
     ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M"] | None]:
-        """Update the tracks by a measurement (BL 38-41).
+        """Update the tracks as `correct` does, and return their log-likelihood and the jitter."""
+        self._now.corner.zero_()  # which loses the squared innovation
+        factor, jitter = self._correct(problem)
+        log_norm = problem.log_norm - _half_log_det(factor)
+        return torch.add(log_norm, self._now.corner, alpha=0.5), jitter
 
-        Returns:
-            The log-likelihood of every track, and the jitter of its covariance, as `mended_cholesky`.
-        """
+    def _correct(
+        self, problem: JointProblem
+    ) -> tuple[Float[Tensor, "B M Z Z"], Float[Tensor, "B M"] | None]:
+        """Update the tracks, and return the factor of their S and its jitter."""
         now, measured = self._now, self._measured
         if problem.both is None:
             covariance = now.block + problem.noise
@@ -218,9 +238,8 @@ class JointTracks:
         factor, jitter = mended_cholesky(covariance)
         torch.linalg.solve_triangular(factor, measured, upper=False, out=measured)
         white = measured.flatten(0, 1)
-        now.corner.zero_()  # which W^T W then makes minus the squared innovation
         now.flat.baddbmm_(white.mT, white, alpha=-1)
-        return torch.add(problem.log_norm - _half_log_det(factor), now.corner, alpha=0.5), jitter
+        return factor, jitter
 
 
 def _half_log_det(factor: Float[Tensor, "*batch Z Z"]) -> Float[Tensor, "*batch"]:
@@ -236,40 +255,46 @@ def joint_estimate(
     jitters: Sequence[Tensor | None],
     return_cov: bool,
 ) -> StepOutput:
-    """Return the estimate of a frame (BL 48); without covariances its mean is that of the tracks [B, M, D].
+    """Return the estimate of a frame (BL 48), in the order of the tracks, for `stacked`.
+
+    Without covariances its mean is that of the tracks [B, M, D].
 
     Args:
         log_evidence: also where nothing is measured; or the log-weights before they are normalised [B, M],
             whose sum it is. jitters: of its covariances.
     """
-    mean = tracks.mean.to(log_weights)
+    mean, cov = tracks.moments
+    mean = mean.to(log_weights, copy=True)  # the next frame overwrites it
     mended = any(jitter is not None for jitter in jitters)
     work = mending(log_weights, *jitters) if mended else (None, None)
     if not return_cov:
         return StepOutput(mean, log_weights, log_evidence, None, *work)
-    estimate, total = estimate_of(log_weights, mean, tracks.cov)
+    estimate, total = estimate_of(log_weights, mean, cov)
     total = None if total is None else symmetrise(total)
     return StepOutput(estimate, log_weights, log_evidence, total, *work)
 
 
-def stacked(steps: Sequence[StepOutput], frames: Measurements) -> FilterOutput:
-    """Stack the frames of some sequences; average the means of tracks, and sum their weights, all at once."""
+def stacked(tracks: JointTracks, steps: Sequence[StepOutput], frames: Measurements) -> FilterOutput:
+    """Stack the frames of some sequences, in the order of the filter's state.
+
+    Means of tracks are averaged, their weights summed and dimensions sorted for all frames at once.
+    """
     log_weights = torch.stack([step.log_weights for step in steps], 1)
     mean = torch.stack([step.mean for step in steps], 1)
     if mean.ndim == 4:
         mean = (log_weights.exp()[..., None, :] @ mean)[..., 0, :]
+    mean = mean[..., tracks.back]
     evidence = torch.stack([step.log_evidence for step in steps], 1)
     if evidence.ndim == 3:
         evidence = torch.logsumexp(evidence, -1)
     evidence = torch.where(frames.mask.any(-1), evidence, torch.zeros_like(evidence))
     covs = [step.cov for step in steps if step.cov is not None]
+    cov = torch.stack(covs, 1)[..., tracks.back[:, None], tracks.back] if covs else None
     none = mending(evidence)
     work = stacked_mending([
         none if s.mended is None or s.jitter is None else Mending(s.mended, s.jitter) for s in steps
     ])  # fmt: skip
-    return FilterOutput(
-        mean, log_weights, evidence, torch.stack(covs, 1) if covs else None, none.mended, *work
-    )
+    return FilterOutput(mean, log_weights, evidence, cov, none.mended, *work)
 
 
 def joined(parts: Sequence[FilterOutput], lengths: Tensor) -> FilterOutput:

@@ -161,7 +161,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
             joint_problems(frames), draws, positions, moves, strict=True
         ):
             tracks.predict(move, drawn)
-            log_likelihood, jitter = tracks.correct(problem)
+            log_likelihood, jitter = tracks.weigh(problem)
             joint = log_weights + log_likelihood.to(self.dtype)
             log_weights = joint.log_softmax(-1)
             steps.append(joint_estimate(tracks, log_weights, joint, [jitter], return_cov))
@@ -171,7 +171,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
                 parent = ancestors(weights.double(), places)
                 tracks.take(torch.where(needed[:, None], parent, own))
                 log_weights = torch.where(needed[:, None], equal, log_weights)
-        return stacked(steps, frames)
+        return stacked(tracks, steps, frames)
 
     def _is_degenerate(self, weights: Tensor) -> Tensor:
         """Return whether the effective sample size of normalised weights is below its share of M, [B]."""

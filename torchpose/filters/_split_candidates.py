@@ -5,8 +5,10 @@ track: with r_z the rows of H F_j,
 
 (H F_j P F_j^T H^T)_zw = sum_{d <= e} g_{zw,de} P_de,   g_{zw,de} = r_zd r_we + r_ze r_wd  (half that, d = e),
 
-one product of the symmetric parts of all P with g, which is made once. The small blocks are factorised
-column by column, each step over all candidates at once.
+one product of the symmetric parts of all P with g, which is made once. The small blocks are eliminated
+column by column, S = L diag(s) L^T, each step over all candidates at once; with u = L^-1 (z - H x),
+
+log N(z | i, j) = -1/2 sum_z (u_z^2 / s_z + log s_z + log 2 pi).
 """
 
 from collections.abc import Sequence
@@ -20,15 +22,13 @@ from torchpose._core.module_state import derived
 from torchpose.filters._joint_tracks import JointProblem, JointTracks, joint_model
 from torchpose.filters._mkf import MixtureKalmanFilter
 
-_LOGS = 8  # standard deviations whose product is within range, and costs one logarithm
-
 
 class SharedCandidates(NamedTuple):
-    """Holds what all frames share, for the Y = Z (Z + 1) / 2 pairs z >= w, column by column.
+    """Holds what all frames share, for the Y = Z (Z + 1) / 2 pairs z >= w, the diagonal first.
 
     Attributes:
-        quadratic: g [D (D + 1) / 2, Y K]. noise: H N_j H^T [Y, K, 1, 1]. rows: -H F_j [D, Z K].
-        offset: H b_j [Z, K, 1, 1]. packed: places of d <= e, then of the mean, in a flat joint matrix.
+        quadratic: g [Y K, D (D + 1) / 2]. noise: H N_j H^T [Y, K, 1, 1]. rows: -H F_j [Z K, D].
+        offset: -H b_j [Z, K, 1, 1]. packed: places of d <= e, then of the mean, in a flat joint matrix.
     """
 
     quadratic: Tensor
@@ -42,7 +42,8 @@ class CandidateProblem(NamedTuple):
     """Holds what B elements measure in one frame, the same for all candidates of an element.
 
     Attributes:
-        z, mask: [Z, 1, B, 1]. noise, both: of the pairs [Y, 1, B, 1]. log_norm: [B, 1]. As in `JointProblem`.
+        z, mask: [Z, 1, B, 1]. noise, both: of the pairs [Y, 1, B, 1], noise that all elements share
+            [Y, 1, 1, 1]. log_norm: [B, 1]. As in `JointProblem`.
     """
 
     z: Tensor
@@ -65,7 +66,7 @@ def candidates(model: MixtureKalmanFilter, time: int) -> SharedCandidates:
     def make() -> SharedCandidates:
         dim, n_obs = model.dim, len(model.observed)
         matrix, noise = joint_model(model, time)
-        rows, device = matrix[:, :n_obs, :dim].transpose(0, 1), matrix.device
+        rows, device = matrix.mT[:, :n_obs, :dim].transpose(0, 1), matrix.device
         row, column = _pairs(n_obs, device)
         d, e = torch.triu_indices(dim, dim, device=device)
         left, right = rows[row], rows[column]
@@ -74,10 +75,10 @@ def candidates(model: MixtureKalmanFilter, time: int) -> SharedCandidates:
         width = matrix.shape[-1]
         mean = torch.arange(dim, device=device) * width + dim
         return SharedCandidates(
-            quadratic.flatten(0, 1).T.contiguous(),
+            quadratic.flatten(0, 1),
             noise[:, row, column].T[..., None, None].contiguous(),
-            -rows.flatten(0, 1).T.contiguous(),
-            noise[:, :n_obs, dim].T[..., None, None].contiguous(),
+            -rows.flatten(0, 1),
+            -noise[:, :n_obs, dim].T[..., None, None],
             torch.cat([d * width + e, mean]),
         )
 
@@ -108,9 +109,10 @@ def _of_elements(values: Float[Tensor, "T B Y"]) -> tuple[Float[Tensor, "Y 1 B 1
 
 
 def _pairs(n_obs: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return z and w of the pairs z >= w, column by column."""
-    column, row = torch.triu_indices(n_obs, n_obs, device=device)
-    return row, column
+    """Return z and w of the pairs z >= w: the diagonal, then columns below it."""
+    column, row = torch.triu_indices(n_obs, n_obs, 1, device=device)
+    diagonal = torch.arange(n_obs, device=device)
+    return torch.cat([diagonal, row]), torch.cat([diagonal, column])
 
 
 class CandidateRoom:
@@ -129,20 +131,24 @@ class CandidateRoom:
             state.new_empty(*like.shape[:2], *self._size[:2])
             for like in (shared.noise, shared.offset)
         )
-        self._white = [*self._residual]
-        columns = [*self._block.split([*range(n_obs, 0, -1)])]
-        self._columns, self._pivots = columns, [column[0] for column in columns]
-        # Of each column of S, what it takes from the residuals and the columns behind it.
-        self._taken = []
-        for c, column in enumerate(columns):
-            below = [(self._residual[c + 1 :], column[1:], self._white[c])]
-            later = [(columns[c + i], column[i:], column[i]) for i in range(1, n_obs - c)]
-            self._taken.append(below + later if later else [])
+        self._pivots = self._block[:n_obs]
+        share = torch.empty_like(self._pivots[1:])
+        columns = self._block[n_obs:].split([*range(n_obs - 1, 0, -1)])
+        # Of each column of S below its pivot, what it is divided by, and what it takes from the rest.
+        self._columns = []
+        for c, below in enumerate(columns):
+            part = share[c:]
+            rest = [
+                (self._pivots[c + 1 :], below, part),
+                (self._residual[c + 1 :], part, self._residual[c]),
+            ]
+            rest += [(columns[c + i], below[i:], part[i - 1]) for i in range(1, len(below))]
+            self._columns.append((below, self._pivots[c], part, rest))
 
     def log_likelihood(
         self, shared: SharedCandidates, tracks: JointTracks, problem: CandidateProblem
     ) -> Float[Tensor, "K B M"]:
-        """Return log N(z | track continued by component), not finite where a block is not positive definite.
+        """Return log N(z | track continued by component), NaN where a block is not positive definite.
 
         Args:
             shared: of the frame. tracks: before the prediction. problem: what is measured.
@@ -150,44 +156,36 @@ class CandidateRoom:
         if tracks.state.shape != self._size:
             self._make_room(shared, tracks.state)
         self._innovate(shared, tracks, problem)
-        # With the pivot s and the column l = S_c / s^1/2, the rest of S = L L^T loses l l^T, and the rest
-        # of the residual loses l v with v = residual_c / s^1/2.
-        columns = zip(self._columns, self._pivots, self._white, self._taken, strict=True)
-        for column, pivot, white, taken in columns:
-            scale = pivot.rsqrt()
-            column.mul_(scale)
-            white.mul_(scale)
-            for rest, below, beside in taken:
-                rest.addcmul_(below, beside, value=-1)
-        found = self._residual.square_().sum(0)
-        return torch.add(problem.log_norm - self._half_log_det(), found, alpha=-0.5)
+        # With the pivot s and the column S_c below it, the rest of S loses S_c S_c^T / s, and the rest of
+        # the residual S_c r_c / s.
+        for below, pivot, share, rest in self._columns:
+            torch.div(below, pivot, out=share)
+            for left, column, row in rest:
+                left.addcmul_(column, row, value=-1)
+        terms = self._residual.square_().div_(self._pivots).add_(self._pivots.log_())
+        return torch.add(problem.log_norm, terms.sum(0), alpha=-0.5)
 
     def _innovate(
         self, shared: SharedCandidates, tracks: JointTracks, problem: CandidateProblem
     ) -> None:
         """Form the measured blocks of S of all candidates, and the innovations."""
-        pairs = len(shared.quadratic)
-        packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed))
-        _product(packed[:, :pairs], shared.quadratic, self._block)
-        _product(packed[:, pairs:], shared.rows, self._residual)
+        pairs = shared.quadratic.shape[1]
+        packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed)).T
+        noise, target = shared.noise, shared.offset
         if problem.both is None:
-            self._block.add_(problem.noise + shared.noise)
-            self._residual.add_(problem.z - shared.offset)
-        else:
-            self._block.add_(shared.noise).mul_(problem.both).add_(problem.noise)
-            self._residual.add_(problem.z - shared.offset).mul_(problem.mask)
-
-    def _half_log_det(self) -> Tensor:
-        total = None
-        for first in range(0, len(self._pivots), _LOGS):
-            product = self._pivots[first]
-            for pivot in self._pivots[first + 1 : first + _LOGS]:
-                product = product.mul_(pivot)
-            total = product.log() if total is None else total + product.log()
-        assert total is not None
-        return total
+            noise, target = noise + problem.noise, target + problem.z
+        _add_product(self._block, noise, shared.quadratic, packed[:pairs])
+        _add_product(self._residual, target, shared.rows, packed[pairs:])
+        if problem.both is not None:
+            self._block.mul_(problem.both).add_(problem.noise)
+            self._residual.add_(problem.z).mul_(problem.mask)
 
 
-def _product(left: Float[Tensor, "n R"], right: Float[Tensor, "R C"], out: Tensor) -> None:
-    """Put (left right)^T into memory of C n numbers; the product in this order takes up to half the time."""
-    out.view(right.shape[1], len(left)).copy_(torch.mm(left, right).T)
+def _add_product(
+    out: Float[Tensor, "Y K B M"],
+    start: Float[Tensor, "Y K #B 1"],
+    left: Float[Tensor, "YK R"],
+    right: Float[Tensor, "R BM"],
+) -> None:
+    """Put start + left right into memory."""
+    out.copy_(start).view(len(left), -1).addmm_(left, right)

@@ -39,7 +39,7 @@ from torchpose.math._gaussian import kalman_correct, kalman_gain, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 _MOST_SHARED = 1 << 22  # numbers, 32 MB, of the product that all frames share
-_RANKS = 1e9  # per nat: log-weights that are nearer are equal
+_RANKS = 1e9  # per nat: log-weights of one rank are equal
 
 
 class _SplitFrame(NamedTuple):
@@ -155,7 +155,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         for frame in self._frames(frames, 0):
             log_weights, step = self._step(tracks, room, log_weights, frame, return_cov)
             steps.append(step)
-        return stacked(steps, frames)
+        return stacked(tracks, steps, frames)
 
     def _filter_in_place(
         self, state: MKFState, frame: Measurements, return_cov: bool
@@ -168,7 +168,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         group = torch.arange(len(log_weights), device=log_weights.device)
         mean, cov = tracks.mean.to(self.dtype), symmetrise(tracks.cov)
         new_state = MKFState(log_weights, mean, cov, group, state.time + 1)
-        return new_state, first_step(stacked([step], frames))
+        return new_state, first_step(stacked(tracks, [step], frames))
 
     def _frames(self, frames: Measurements, first: int) -> list[_SplitFrame]:
         """Return the frames of some sequences, of which the first one has number `first`."""
@@ -196,8 +196,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         log_likelihood = room.log_likelihood(frame.shared, tracks, frame.own)
         jitter = None
         if math.isfinite(log_likelihood.sum()):
-            log_joint = log_likelihood.add_(log_weights).add_(self.log_prior[:, None, None])
-            log_joint = log_joint.permute(1, 2, 0)
+            log_joint = (log_weights[..., None] + self.log_prior) + log_likelihood.permute(1, 2, 0)
         else:  # a block is to be mended, or lost
             group = torch.arange(len(log_weights), device=log_weights.device)
             state = MKFState(log_weights, tracks.mean, tracks.cov, group, frame.time)
@@ -207,7 +206,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         log_weights, log_evidence, parent, component = self._select(log_joint)
         tracks.take(parent)
         tracks.predict(frame.move, component)
-        jitters = [jitter, tracks.correct(frame.problem)[1]]
+        jitters = [jitter, tracks.correct(frame.problem)]
         log_evidence = log_evidence.to(self.dtype)
         return log_weights, joint_estimate(tracks, log_weights, log_evidence, jitters, return_cov)
 
@@ -222,7 +221,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
         spare = max(0, self.n_tracks - flat.shape[1])
         padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf) if spare else flat
-        chosen = _first_of_largest((padded * _RANKS).round_(), self.n_tracks)
+        chosen = _first_of_largest(padded, self.n_tracks)
         log_weights = padded.gather(1, chosen).log_softmax(-1).to(self.dtype)
         if spare:
             chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
@@ -270,10 +269,11 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         return mean, cov, gain.jitter
 
 
-def _first_of_largest(ranks: Float[Tensor, "B N"], count: int) -> Int[Tensor, "B n"]:
-    """Return the places of the largest numbers in falling order, of equal ones the first places."""
+def _first_of_largest(log_weights: Float[Tensor, "B N"], count: int) -> Int[Tensor, "B n"]:
+    """Return the places of the largest log-weights in falling order, of equal ones the first places."""
     if values_visible():
-        largest, places = ranks.topk(min(count + 1, ranks.shape[1]), 1)
-        if bool((largest[:, :-1] > largest[:, 1:]).all()):  # none is equal to another, nor NaN
+        largest, places = log_weights.topk(min(count + 1, log_weights.shape[1]), 1)
+        if bool((largest[:, :-1] - largest[:, 1:] > 2 / _RANKS).all()):  # ranks differ, none is NaN
             return places[:, :count]
+    ranks = (log_weights * _RANKS).round()
     return ranks.sort(dim=1, descending=True, stable=True).indices[:, :count]
