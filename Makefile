@@ -70,7 +70,9 @@ install: $(VENV)/.installed-dev
 
 # The stamps are written last. An installation that was killed leaves .installing behind, with the id
 # of its process, and the next one starts with a new environment. pip would compile one module after the
-# other, in one process; a few modules of other libraries are for other versions of Python.
+# other, in one process; a few modules of other libraries are for other versions of Python. Of the
+# unused ones hardly any is ever imported; Python compiles these then.
+UNUSED := tests?|_inductor|fontTools|kornia|mypyc?|networkx|onnxruntime|pip|pygments|setuptools
 $(VENV)/.installed-%: pyproject.toml constraints.txt
 	@set -e; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -82,7 +84,7 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt
 	echo $$$$ > $(VENV)/.installing; \
 	echo "installing torchpose[$*] into $(VENV)"; \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[$*]'; \
-	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true; \
+	$(BIN)/python -m compileall -qq -j 0 -x '/($(UNUSED))/' $(VENV)/lib || true; \
 	touch $@; \
 	rm $(VENV)/.installing
 
