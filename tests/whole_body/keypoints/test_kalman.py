@@ -28,6 +28,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
 )
 
 J = BODY_15.joint
+T = 34
 
 
 def tracker(rig, **options):
@@ -42,7 +43,7 @@ def track(given, smoothing="none", **options):
 
 @pytest.fixture(scope="module")
 def four():
-    return scene(4)
+    return scene(4, T)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +96,7 @@ def test_noise_of_keypoints_is_told_within_a_second():
 
 
 def test_bones_become_those_of_the_person():
-    tall = scene(4, 50, height=1.95)
+    tall = scene(4, T, height=1.95)
     found = track(tall)
     wanted = Body.of_height(BODY_15, 1.95).bone_lengths
     for name in ("left_knee", "right_ankle", "left_elbow"):
@@ -151,13 +152,13 @@ def test_a_motion_is_taken_by_its_name_or_as_it_is(four, filtered):
 
 @pytest.mark.parametrize("away", [100.0, 1e4, 1e6])
 def test_one_wild_keypoint_moves_nothing(four, filtered, away):
-    given = beginning(four, 24)
+    given = beginning(four, 16)
     keypoints = given.keypoints.clone()
-    keypoints[20, 1, J("left_wrist")] += away
+    keypoints[12, 1, J("left_wrist")] += away
     found = track(given._replace(keypoints=keypoints))
-    moved = (found.joints3d - filtered.joints3d[:24]).norm(dim=-1)
-    assert float(moved[20].max()) < 0.04 and float(moved[23].max()) < 0.02
-    assert float(found.details["inlier"][20, 1, J("left_wrist")]) < 0.01
+    moved = (found.joints3d - filtered.joints3d[:16]).norm(dim=-1)
+    assert float(moved[12].max()) < 0.04 and float(moved[15].max()) < 0.02
+    assert float(found.details["inlier"][12, 1, J("left_wrist")]) < 0.01
 
 
 def test_exchanged_sides_of_a_camera_are_told_and_undone(four):
@@ -186,7 +187,7 @@ def test_a_joint_that_no_camera_sees_goes_on_and_comes_back(four):
 
 
 def test_a_limb_that_jumps_is_found_again(four):
-    joints = moving_body(40)
+    joints = moving_body(T)
     joints[20:, J("left_wrist")] = joints[20:, J("left_elbow")] + (
         joints[20:, J("left_elbow")] - joints[20:, J("left_wrist")]
     )
@@ -241,18 +242,18 @@ def test_one_camera_sees_who_was_away_for_a_second_as_for_the_first_time(returni
 @pytest.mark.parametrize("smoothing", ["none", "full"])
 def test_who_comes_late_has_no_earlier_pose(smoothing):
     """The pose, body and all are those of the same keypoints without the empty frames before."""
-    small = scene(3, 12, height=0.9)
+    small = scene(3, 6, height=0.9)
     late = torch.cat([torch.full_like(small.keypoints, math.nan), small.keypoints])
     found, alone = (
         tracker(small.rig)(keypoints=k, smoothing=smoothing) for k in (late, small.keypoints)
     )
-    assert found.first_frame == 12 and len(found) == 12
-    assert found.notes == (*alone.notes, late_note(12, TOO_FEW)[0])
+    assert found.first_frame == 6 and len(found) == 6
+    assert found.notes == (*alone.notes, late_note(6, TOO_FEW)[0])
     torch.testing.assert_close(found.joints3d, alone.joints3d, rtol=0, atol=0)
     torch.testing.assert_close(found.state, alone.state, rtol=0, atol=0)
     assert found.body.height == pytest.approx(0.9, abs=0.1)
     together = tracker(small.rig)(keypoints=torch.stack([late, late.flip(0)]), smoothing=smoothing)
-    assert [(one.first_frame, len(one)) for one in together] == [(12, 12), (0, 24)]
+    assert [(one.first_frame, len(one)) for one in together] == [(6, 6), (0, 12)]
     torch.testing.assert_close(together[0].joints3d, alone.joints3d)
 
 
@@ -268,11 +269,11 @@ def test_a_late_track_is_written_with_its_frames(tmp_path):
 
 
 def test_cameras_of_a_late_track_are_refined_from_its_beginning():
-    given = scene(2, 30)
+    given = scene(2, 12)
     late = torch.cat([torch.full_like(given.keypoints[:6], math.nan), given.keypoints])
     found = tracker(given.rig)(keypoints=late, refine="extrinsics")
-    assert (found.first_frame, len(found)) == (6, 30)
-    assert len(found.details["camera_delays"]) == 30
+    assert (found.first_frame, len(found)) == (6, 12)
+    assert len(found.details["camera_delays"]) == 12
 
 
 def test_live_there_is_no_pose_before_the_first(four):
@@ -407,7 +408,7 @@ def test_frame_by_frame_gives_the_same(four, filtered):
 
 
 def test_a_batch_gives_each_its_own(four, filtered):
-    other = scene(4, seed=5)
+    other = scene(4, T, seed=5)
     both = tracker(four.rig)(
         keypoints=torch.stack([other.keypoints, four.keypoints]),
         confidence=torch.stack([other.confidence, four.confidence]),
@@ -418,13 +419,13 @@ def test_a_batch_gives_each_its_own(four, filtered):
 @pytest.mark.parametrize("smoothing", ["none", "full"])
 @pytest.mark.parametrize("n_cameras", [1, 4])
 def test_a_batch_of_different_lengths_gives_each_its_own(n_cameras, smoothing):
-    given = scene(n_cameras, 24)
+    given = scene(n_cameras, 12)
     keypoints, confidence = (
         given.keypoints.repeat(3, 1, 1, 1, 1),
         given.confidence.repeat(3, 1, 1, 1),
     )
     keypoints[1] += 1.5
-    lengths = torch.tensor([9, 20, 16])
+    lengths = torch.tensor([5, 10, 8])
     close = (
         1e-9 if n_cameras > 1 else 1e-6
     )  # of one camera a network of single precision lifts poses
@@ -443,13 +444,13 @@ def test_a_batch_of_different_lengths_gives_each_its_own(n_cameras, smoothing):
             own = getattr(alone, name)
             torch.testing.assert_close(getattr(track, name)[:n], own, rtol=0, atol=close)
             torch.testing.assert_close(getattr(cut, name)[:n], own, rtol=0, atol=1e-9)
-        assert track.notes == cut.notes == alone.notes and len(track) == len(cut) == 24
+        assert track.notes == cut.notes == alone.notes and len(track) == len(cut) == 12
         assert (track.joints3d[n:] == track.joints3d[n - 1]).all()
         assert not track.log_evidence[n:].any()
 
 
 def test_lengths_that_no_sequence_has_are_refused(four):
-    for wrong in ([0], [41], [3, 4]):
+    for wrong in ([0], [T + 1], [3, 4]):
         with pytest.raises((InputError, ShapeError), match="lengths must"):
             tracker(four.rig)(keypoints=four.keypoints, lengths=torch.tensor(wrong))
     detections = four.keypoints[:, :, None]
@@ -552,9 +553,9 @@ def test_a_known_body_keeps_its_bones(four, filtered):
         ({"keypoints": torch.full((3, 4, 15, 2), torch.nan)}, NobodySeenError, "no keypoint"),
         ({"keypoints": torch.zeros(0, 3, 4, 15, 2)}, InputError, "at least one sequence"),
         ({"names": ["nose"] * 15}, SkeletonError, "nose"),
-        ({"confidence": torch.full((40, 4, 15), -1.0)}, InputError, "in \\[0, 1\\]"),
-        ({"confidence": torch.ones(40, 4, 3)}, ShapeError, "confidence"),
-        ({"covariance": torch.zeros(40, 4, 15)}, InputError, "covariance"),
+        ({"confidence": torch.full((T, 4, 15), -1.0)}, InputError, "in \\[0, 1\\]"),
+        ({"confidence": torch.ones(T, 4, 3)}, ShapeError, "confidence"),
+        ({"covariance": torch.zeros(T, 4, 15)}, InputError, "covariance"),
         ({"smoothing": "some"}, InputError, "smoothing"),
         ({"keypoints": None}, InputError, "keypoints"),
     ],
