@@ -56,7 +56,7 @@ from torchpose.whole_body._keypoints.turned_cameras import (
 
 @pytest.fixture(scope="module")
 def three():
-    return scene(3, n_frames=22)
+    return scene(3, n_frames=18)
 
 
 def track(keypoints, rig):

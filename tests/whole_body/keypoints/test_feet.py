@@ -37,7 +37,7 @@ def standing_feet(joints):
     return torch.cat(sides, 1)
 
 
-def with_feet(cameras=4, n_frames=30, noise=4.0, seed=0):
+def with_feet(cameras=4, n_frames=24, noise=4.0, seed=0):
     """A scene, its feet, and keypoints [T, C, 21, 2] of joints and feet with noise."""
     shown = scene(cameras, n_frames, noise, seed)
     feet = standing_feet(shown.joints)
@@ -298,7 +298,7 @@ def test_feet_of_another_size_are_refused(tmp_path, tracked):
     details = {**tracked.details, "feet": tracked.details["feet"][:, :5]}
     BodyTrack(**{**vars(tracked), "details": details}).save(path)
     with pytest.raises(
-        FileFormatError, match=r"detail_feet of the sizes \[30, 6, 3\], got \[30, 5"
+        FileFormatError, match=r"detail_feet of the sizes \[24, 6, 3\], got \[24, 5"
     ):
         BodyTrack.load(path)
 

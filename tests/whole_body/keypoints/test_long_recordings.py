@@ -14,7 +14,7 @@ from torchpose.whole_body._keypoints import body_smoothing, foot_tracker, nested
 from torchpose.whole_body._keypoints.nested import FrameCollector, by_parts, stacked
 
 _N_FRAMES = 34  # whose states are larger than the matrices of the network that lifts
-_FEW_FRAMES = 16
+_FEW_FRAMES = 10
 
 
 def in_parts_of(count, monkeypatch):
@@ -39,7 +39,7 @@ def tracked(n_cameras, smoothing, feet=False, n_frames=_FEW_FRAMES):
 @pytest.mark.parametrize(("n_cameras", "feet"), [(3, True), (1, False)])
 def test_parts_give_the_numbers_of_all_frames(monkeypatch, n_cameras, feet, smoothing):
     whole = tracked(n_cameras, smoothing, feet)
-    in_parts_of(7, monkeypatch)
+    in_parts_of(4, monkeypatch)
     parts = tracked(n_cameras, smoothing, feet)
     names = ("state", "state_std", "joints3d", "covariance3d", "log_evidence")
     pairs = [(getattr(parts, name), getattr(whole, name)) for name in names]
