@@ -31,7 +31,7 @@ NAMES = list(KEYPOINT_NAMES)
 
 @pytest.fixture(scope="module")
 def keypoints():
-    return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
+    return noisy_keypoints(performer(24, seed=0).joints, std_px=3.0)[None]
 
 
 def poses(tracker, keypoints):
