@@ -330,14 +330,30 @@ def test_a_second_camera_begins_anew_what_one_had_to_guess():
     assert float(off[:4].min()) > 0.5 and float(off[4:].max()) < 0.05
 
 
-def test_another_camera_goes_on_where_the_only_one_loses_the_person():
+def handed(first, second):
+    """The keypoints of camera 0 in 20 frames, then those that camera 1 has of somebody."""
+    keypoints = torch.full_like(first.keypoints, math.nan)
+    keypoints[:20, 0], keypoints[20:, 1] = first.keypoints[:20, 0], second.keypoints[20:, 1]
+    return keypoints
+
+
+def test_one_camera_hands_a_person_to_the_next():
+    """As in a corridor where no two cameras see the same place."""
+    given = scene(2, 26, noise=2.0)
+    found = tracker(given.rig)(keypoints=handed(given, given))
+    assert found.first_frame == 16 and not found.coasting.any()
+    assert found.respread.nonzero().tolist() == [[4]]
+    assert float(errors(found, given.joints[16:]).mean(-1).max()) < 0.4
+
+
+def test_another_camera_that_sees_somebody_else_goes_on_after_half_a_second():
     given = scene(2, 40, noise=2.0)
-    given.keypoints[:20, 1] = torch.nan
-    given.keypoints[20:, 0] = torch.nan
-    found = tracker(given.rig)(keypoints=given.keypoints)
+    aside = given.joints + torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64)
+    other = given._replace(keypoints=given.rig(aside).pixels)
+    found = tracker(given.rig)(keypoints=handed(given, other))
     assert found.respread.nonzero().tolist() == [[20]]
     assert found.coasting[4:20].all() and not found.coasting[20:].any()
-    assert float(errors(found, given.joints[16:])[20:].mean()) < 0.4
+    assert float(errors(found, aside[16:])[20:].mean()) < 0.4
 
 
 def _centre(rig, camera):

@@ -52,6 +52,7 @@ from torchpose.whole_body._keypoints.lone_camera import (
     NOBODY,
     SAME_NOISE,
     LoneNoise,
+    are_together,
     frame_of,
     step_by_one,
     stream_of,
@@ -249,6 +250,24 @@ class KeypointTracker(nn.Module):
                 if len(rows):
                     after = self._by_camera(camera, own, frame.take(rows), taken(step, rows))
                     step = replaced(step, rows, after)
+        return self._handed_over(frame, step)
+
+    def _handed_over(self, frame: KeypointFrame, step: KeypointStep) -> KeypointStep:
+        """Return the next frame with those whom their camera has lost followed by one that finds them there.
+
+        Who begins anew in another camera must be where the person is expected. Somebody else does not replace
+        a person whom a detector misses for a moment.
+        """
+        stream, pose, _ = step
+        enough = sees_enough(frame)
+        by_own = enough.gather(1, stream.alone.clamp_min(0)[:, None]).squeeze(1)
+        left = (stream.alone >= 0) & ~by_own & enough.any(-1)
+        other = (frame.inlier > 0).sum(-1).argmax(-1)
+        for camera in other[left].unique().tolist():
+            rows = (left & (other == camera)).nonzero().squeeze(-1)
+            begun = self._by_camera(camera, None, frame.take(rows), taken(step, rows))
+            found = are_together(taken(pose, rows), begun[1]).nonzero().squeeze(-1)
+            step = replaced(step, rows[found], taken(begun, found))
         return step
 
     def _by_camera(

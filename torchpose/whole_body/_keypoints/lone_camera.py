@@ -3,16 +3,23 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.body._skeleton import BODY_15
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_poses import KeypointStep, KeypointStream
+from torchpose.whole_body._keypoints.keypoint_poses import (
+    KeypointPoses,
+    KeypointStep,
+    KeypointStream,
+)
 from torchpose.whole_body._keypoints.nested import mapped
 
 NOBODY = -1
 """In place of the camera that alone sees a person, where there is none."""
+_TOGETHER = 16.3  # squared standard deviations within which 99.9 % of places in the room are
+_PELVIS = BODY_15.joint("pelvis")
 
 
 class LoneNoise(NamedTuple):
@@ -77,6 +84,13 @@ def step_by_one(step: KeypointStep, by_one: KeypointStep, camera: int) -> Keypoi
         scale=scale,
     )
     return stream, pose, found_by_one._replace(state=state, weighed=found.weighed)
+
+
+def are_together(poses: KeypointPoses, others: KeypointPoses) -> Bool[Tensor, " B"]:
+    """Return which bodies are at the same places as others, by the covariances of both."""
+    apart = (poses.joints - others.joints)[:, _PELVIS]
+    cov = (poses.covariance + others.covariance)[:, _PELVIS]
+    return (apart * torch.linalg.solve(cov, apart)).sum(-1) < _TOGETHER
 
 
 def _by_cameras(state: BodyGaussian) -> tuple[Tensor, Tensor, Tensor]:
