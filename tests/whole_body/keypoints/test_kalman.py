@@ -360,6 +360,25 @@ def _centre(rig, camera):
     return -rig.rotation[camera].T @ rig.translation[camera]
 
 
+# --- behind a desk ----------------------------------------------------------------------------------
+
+HIPS = [J(name) for name in ("pelvis", "left_hip", "right_hip")]
+
+
+def test_hips_that_no_camera_sees_go_along_with_who_walks():
+    """As behind a counter: shoulders and arms alone are seen, and the neck is the middle of the shoulders."""
+    given = scene(3, 34)
+    way = torch.linspace(-0.7, 0.75, 34, dtype=torch.float64)
+    joints = given.joints + torch.stack([way, 0 * way, 0.5 * way], -1)[:, None]
+    keypoints = given.rig(joints).pixels
+    shoulders = [J("left_shoulder"), J("right_shoulder")]
+    keypoints[:, :, J("neck")] = keypoints[:, :, shoulders].mean(2)
+    legs = [j for j, name in enumerate(NAMES) if name.endswith(("knee", "ankle"))]
+    keypoints[:, :, HIPS + legs] = math.nan
+    found = tracker(given.rig)(keypoints=keypoints)
+    assert float((found.joints3d - joints)[20:, HIPS].norm(dim=-1).mean()) < 0.06
+
+
 # --- cameras that disagree --------------------------------------------------------------------------
 
 

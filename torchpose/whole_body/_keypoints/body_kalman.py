@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from torchpose._core.module_state import derived
 from torchpose.body._articulation import BodyPoint
+from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.math._gaussian import point_blocks
 from torchpose.priors._body_motion import BodyMotion
@@ -55,12 +56,13 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 from torchpose.whole_body._keypoints.nested import replaced, taken
-from torchpose.whole_body._keypoints.upright import Upright, upright_of
+from torchpose.whole_body._keypoints.upright import Upright, level_cameras_up, upright_of
 
 FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
 
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
+_CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which no camera sees a hip
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
@@ -69,6 +71,7 @@ _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which si
 _SCALE_TIME = 2.0  # seconds over which the factors of the cameras' noise are averaged
 _WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of the noise that are tried for cameras with few inliers
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
+_HIPS = [BODY_15.joint(name) for name in ("pelvis", "left_hip", "right_hip")]
 
 
 class BodyGaussian(NamedTuple):
@@ -225,6 +228,38 @@ class BodyKalmanFilter(nn.Module):
         readings = readings_of(frame, self.exchange)
         if widths is not None:
             return self._iterated(state, readings, widths)
+        rows = self._without_hips(frame)
+        if not len(rows):
+            return self._corrected_as_predicted(state, frame, readings)
+        carried = torch.zeros_like(state.cov[..., 0])
+        carried[rows, self.articulation.columns["position"]] = _CARRIED**2 / self.fps
+        state = state._replace(cov=state.cov + torch.diag_embed(carried))
+        state = replaced(state, rows, self._balanced(taken(state, rows)))
+        corrected = self._corrected_as_predicted(state, frame, readings)
+        return corrected._replace(widened=corrected.widened + carried)
+
+    def _without_hips(self, frame: KeypointFrame) -> Int[Tensor, " N"]:
+        """Return the elements of whom none of several cameras sees a hip, but something else.
+
+        Such a pelvis has to go along with the trunk. It would lag behind who walks, since its own speed is
+        expected to decay, and the trunk would lean over more and more.
+        """
+        seen = (frame.inlier > 0).any(1)
+        rows = seen.any(-1) & ~seen[:, _HIPS].any(-1) & (len(self.maps.shift) > 1)
+        return rows.nonzero().squeeze(-1)
+
+    def _balanced(self, state: BodyGaussian) -> BodyGaussian:
+        """Return Gaussians after a share of the information about leans where cameras are about level."""
+        if self.upright is not None:  # `predict` has done so
+            return state
+        rig = self._rig[0]
+        up = derived(self, "level", (rig.rotation,), lambda: level_cameras_up(rig))
+        return self._erected(state, up, self.transition.share)
+
+    def _corrected_as_predicted(
+        self, state: BodyGaussian, frame: KeypointFrame, readings: KeypointFrame
+    ) -> CorrectedBody:
+        """Return the posterior of a prediction, from a wider one where a joint has jumped."""
         found = self._linearised(state, state.mean, readings)
         doubt, jumped = self._doubts(state, readings, found)
         state = state._replace(doubt=doubt)

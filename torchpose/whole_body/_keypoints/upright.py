@@ -69,6 +69,12 @@ def camera_up(rig: CameraRig) -> Upright:
     return Upright(direction, torch.tensor(_MEAN).to(direction), std.square() + tilt.square())
 
 
+def level_cameras_up(rig: CameraRig) -> Upright:
+    """Return what is expected where several cameras are level on average."""
+    direction = torch.nn.functional.normalize(-rig.rotation[:, 1].mean(0), dim=-1)
+    return camera_up(rig)._replace(direction=direction)
+
+
 def known_up(rig: CameraRig, up: str) -> Upright:
     """Return what is expected where an axis of the world is known to point up.
 
