@@ -9,6 +9,7 @@ from torchpose.errors import InputError, ShapeError
 from torchpose.measure import HaarFaceDetector
 from torchpose.measure._face import FaceTracker
 from torchpose.measure._face_detector import Region
+from torchpose.measure._grey_frame import GreyFrame
 
 
 def nobody(image, region=None):
@@ -113,16 +114,25 @@ def test_a_face_that_is_not_where_it_was_expected_is_searched_for_in_more_of_the
     assert asked == [around.left] * 9 + [close.left] * (frames - 10)
 
 
-def test_frames_without_a_search_need_no_image():
-    tracker, states, detector = follow([[[300.0, 200.0, 90.0]]] * 12, every=2, whole_every=10)
-    before, image = [tracker.init(), *states[:-1]], np.full((480, 640), 3, np.uint8)
-    skipped = [t for t, tracks in enumerate(before) if not tracker.searches(tracks)]
-    assert skipped == [3, 5, 7, 9, 11]
-    detector.asked.clear()
-    for t, tracks in enumerate(before):
-        after = tracker.step(tracks, image if tracker.searches(tracks) else None)
-        assert torch.equal(after.mean, states[t].mean) and after.frame == t + 1
-    assert len(detector.asked) == 12 - len(skipped) + 1  # in one of them everywhere too
+def test_frames_are_made_grey_where_they_are_searched():
+    """As whole ones are: of a face that moves, that is lost, and that jumps aside. Most are not at all."""
+    face, tracker, parts = portrait(80), FaceTracker(whole_every=100), []
+
+    class Noted(GreyFrame):
+        def at(self, part):
+            parts[-1].append((part.bottom - part.top) * (part.right - part.left) / face.size)
+            return super().at(part)
+
+    states = [tracker.init()] * 2
+    for t in range(40):
+        lost = t in range(25, 30)
+        image = np.full_like(face, 128) if lost else np.roll(face, 2 * t + 20 * (t > 32), axis=1)
+        parts.append([])
+        frame = Noted(np.repeat(image[..., None], 3, 2))
+        states = [tracker.step(states[0], image), tracker.step(states[1], frame)]
+        assert torch.equal(states[0].mean, states[1].mean)
+    assert len(states[0].mean) == 1
+    assert parts[21] == parts[23] == [] and max(map(max, filter(None, parts[4:]))) < 0.4
 
 
 def test_without_a_face_the_whole_image_is_searched_now_and_then():

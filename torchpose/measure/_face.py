@@ -23,6 +23,7 @@ from torchpose.measure._face_detector import (
     scaled_back,
 )
 from torchpose.measure._face_patterns import far_smaller, on_somebody
+from torchpose.measure._grey_frame import GreyFrame
 
 # About a known face: half the side of the searched region, smallest and largest face there, in its sizes.
 _CLOSE, _AROUND = (0.8, 0.8, 1.3), (1.1, 0.75, 1.4)
@@ -155,11 +156,6 @@ class FaceTracker(nn.Module):
         used = enough & ~on_somebody(tracks.mean[:, :3], enough)
         return used & ~far_smaller(tracks.mean[:, 2], tracks.largest <= _USUAL, used)
 
-    def searches(self, tracks: FaceTracks) -> bool:
-        """Return whether faces are searched for in the next frame, so that `step` needs its image."""
-        used = self.usable(tracks)
-        return self._is_due(tracks.frame, bool(used.any()), self._interval(tracks, used))
-
     def _is_due(self, frame: int, known: bool, interval: int) -> bool:
         """Return whether a frame is searched, by its number and whether a face is known."""
         return not known or not (frame % self.every and frame % interval)
@@ -172,12 +168,12 @@ class FaceTracker(nn.Module):
             return self.whole_every
         return min(self.whole_every, _SEARCHES_FOR_LARGER * self.search_every)
 
-    def step(self, tracks: FaceTracks, image: Image | None) -> FaceTracks:
+    def step(self, tracks: FaceTracks, image: Image | GreyFrame) -> FaceTracks:
         """Return the faces of the next frame.
 
         Args:
             tracks: from `init` or the step before.
-            image: grey, [H, W], uint8; may be None where `searches` is False.
+            image: grey, [H, W], uint8, or a frame that is made grey where it is looked at.
 
         Raises:
             InputError: another kind of image.
@@ -185,7 +181,7 @@ class FaceTracker(nn.Module):
         predicted = self._predict(tracks)
         used = self.usable(tracks)
         known, interval = bool(used.any()), self._interval(tracks, used)
-        if image is None or not self._is_due(tracks.frame, known, interval):
+        if not self._is_due(tracks.frame, known, interval):
             return predicted
         everywhere = tracks.frame % interval == 0
         faces, lasting = predicted.mean[:, :3].tolist(), (predicted.hits >= _LASTING).tolist()
@@ -199,22 +195,28 @@ class FaceTracker(nn.Module):
             return predicted
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
-    def _look_everywhere(self, image: Image, plain: bool, turn: float) -> Float[Tensor, "N 3"]:
+    def _look_everywhere(
+        self, image: Image | GreyFrame, plain: bool, turn: float
+    ) -> Float[Tensor, "N 3"]:
         """Return the detections in the whole image: where these are none, tilted or small ones as well.
 
         Args:
             plain: whether tilted and small faces are left out. turn: of the image, degrees.
         """
+        height, width = image.shape
+        small = Region(0, 0, width, height, self.smallest, _USUAL)
+        image = _seen_in(image, small)
         found = self.detector(image)
         if plain or len(found):
             return found
         found = _turned_search(self.detector, image, None, turn)
         if len(found) or self.smallest >= _USUAL:
             return found
-        height, width = image.shape
-        return self.detector(image, Region(0, 0, width, height, self.smallest, _USUAL))
+        return self.detector(image, small)
 
-    def _look_near(self, image: Image, face: list[float], lasting: bool) -> Float[Tensor, "N 3"]:
+    def _look_near(
+        self, image: Image | GreyFrame, face: list[float], lasting: bool
+    ) -> Float[Tensor, "N 3"]:
         """Return the detections about a known face; close to it alone if a lasting one is as predicted.
 
         The closer search takes half the time, and misses who moves quickly. It would find patterns again that
@@ -228,7 +230,7 @@ class FaceTracker(nn.Module):
 
     def _look_about(
         self,
-        image: Image,
+        image: Image | GreyFrame,
         face: list[float],
         reach: tuple[float, float, float],
         turns: tuple[float, ...],
@@ -239,6 +241,7 @@ class FaceTracker(nn.Module):
             reach: see `_CLOSE`. turns: degrees by which the image is turned while nothing is found.
         """
         region = _region(face, image.shape, *reach)
+        image = _seen_in(image, region)
         part = image[region.top : region.bottom, region.left : region.right]
         scale = self.detail / max(face[2], 1.0)
         if round(scale * min(part.shape)) < 1:  # the face is outside, or all but outside
@@ -311,6 +314,11 @@ def _some(tracks: FaceTracks, rows: Bool[Tensor, " N"]) -> FaceTracks:
     """Return some of the tracks."""
     fields = (value[rows] if isinstance(value, Tensor) else value for value in tracks)
     return FaceTracks(*fields)  # type: ignore[arg-type]
+
+
+def _seen_in(image: Image | GreyFrame, region: Region) -> Image:
+    """Return the image, of which this region is looked at."""
+    return image.at(region) if isinstance(image, GreyFrame) else image
 
 
 def _whole(image: Image, sizes: Region, scale: float) -> Region:

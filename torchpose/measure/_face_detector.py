@@ -47,7 +47,8 @@ class FaceDetector(Protocol):
         """Return centre (x, y) and size (side of the square bounding box) of every face, pixels.
 
         Args:
-            image: [H, W], uint8. region: the searched part of the image; None is the whole image.
+            image: [H, W], uint8. region: the searched part of the image, which may be 0 elsewhere; None is
+                the whole image.
         """
         ...
 

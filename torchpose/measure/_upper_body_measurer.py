@@ -16,6 +16,7 @@ from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
 from torchpose.measure._face import FaceTracker, FaceTracks
 from torchpose.measure._face_detector import FaceDetector, scaled_back
+from torchpose.measure._grey_frame import GreyFrame, grey_scale
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
@@ -42,7 +43,6 @@ _HANDS = [MEASURED.index("hand_left"), MEASURED.index("hand_right")]
 HAND_TRACKERS = ("learnt", "grid", "mean-shift")
 """Names of the hand trackers, the default first."""
 
-_LARGEST_SIDE = 960  # of the image in which faces are detected, pixels
 _UNSEEN = 1.0  # seconds over which a face that is not detected counts as measured
 _LEVEL = math.sqrt(2.0)
 _MOVES = 0.15  # deviation of a hand's motion in a frame, in sizes of the face
@@ -242,15 +242,7 @@ class UpperBodyMeasurer(nn.Module):
 
     def _follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
         """Return the faces of the next frame, in pixels of a smaller image where the frame is large."""
-        import cv2
-
-        if not self.face_tracker.searches(tracks):
-            return self.face_tracker.step(tracks, None)
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        scale = _face_scale(image)
-        if scale < 1:
-            grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        return self.face_tracker.step(tracks, np.asarray(grey, dtype=np.uint8))
+        return self.face_tracker.step(tracks, GreyFrame(image))
 
     @as_one_run
     def step(
@@ -353,7 +345,7 @@ class UpperBodyMeasurer(nn.Module):
         A face that is not detected any more is taken to be turned away or covered, unless the border of the
         image cuts it or the clothes below are not there any more: then the person has left, or is hidden.
         """
-        scale, at, half = _face_scale(image), tracks.mean[:, :2], tracks.mean[:, 2:3] / 2
+        scale, at, half = grey_scale(image), tracks.mean[:, :2], tracks.mean[:, 2:3] / 2
         end = scale * at.new_tensor([image.shape[1], image.shape[0]])
         detected = tracks.unseen <= 2 * self.face_tracker.every
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
@@ -393,7 +385,3 @@ def rounded_covariance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batc
     variance = cov.diagonal(dim1=-2, dim2=-1).mean(-1)
     std = _LEVEL ** (0.5 * variance.log() / math.log(_LEVEL)).round()
     return std.square()[..., None, None] * torch.eye(2, dtype=cov.dtype, device=cov.device)
-
-
-def _face_scale(image: Image) -> float:
-    return min(1.0, _LARGEST_SIDE / max(image.shape[:2]))
