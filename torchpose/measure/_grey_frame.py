@@ -56,7 +56,6 @@ class GreyFrame:
             own = cv2.resize(own, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         (top, bottom), (left, right) = ends
         place = grey[top:bottom, left:right]
-        own = own[
-            : place.shape[0], : place.shape[1]
-        ]  # half a pixel at an end is rounded either way
+        # Half a pixel at an end is rounded either way.
+        own = own[: place.shape[0], : place.shape[1]]
         place[: own.shape[0], : own.shape[1]] = own
