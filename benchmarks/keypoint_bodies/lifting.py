@@ -30,8 +30,9 @@ from torchpose.whole_body._keypoints.lifting_network import LiftingNetwork, Lift
 __all__ = ["fit_shipped"]
 
 _STEPS, _QUICK_STEPS = 10_000, 2
-_SEAT_SHARE, _SEAT_STEPS, _SEAT_RATE = 0.25, 0.2, 1e-3
-# Of the pieces people sit in after the first fit; share of its steps that follow; rate of learning.
+_LATER_STEPS = 0.2  # of each later fit, as a share of the steps of the first one
+_LATER_RATE = 1e-3  # of learning
+_SEAT_SHARE = 0.25  # of the pieces of the last fit
 _LONGEST = 600  # frames of a recording
 _UNIT = 0.3  # metres in which errors count
 _KINECT_SHARE = 0.5  # of the pieces
@@ -75,7 +76,25 @@ def _fitted(
     network = LiftingNetwork(info)
     shares = ((1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect))
     train_lifter(network, _loss(network, LiftingExamples(shares, seed)), steps, "lifting network")
-    return with_seats(network, shares, max(1, int(_SEAT_STEPS * steps)), seed)
+    later = max(1, int(_LATER_STEPS * steps))
+    return with_seats(at_any_rate(network, shares, later, seed), shares, later, seed)
+
+
+def at_any_rate(
+    network: LiftingNetwork, shares: Shares, steps: int, seed: int = 0
+) -> LiftingNetwork:
+    """Return a network that was fitted on, to pieces of any frame rate.
+
+    Walks are recorded at other rates than exercises, so the rate alone tells the first fit which of the two
+    a piece is of, and it takes everybody at 30 frames a second for somebody who exercises.
+
+    Args:
+        network: of the first fit, changed in place. shares: as of `LiftingExamples`.
+        steps: of AdamW. seed: of pieces, the second next one is taken.
+    """
+    draw = LiftingExamples(shares, seed + 2, any_rate=True)
+    train_lifter(network, _loss(network, draw), steps, "any frame rate", _LATER_RATE)
+    return network
 
 
 def with_seats(
@@ -83,19 +102,19 @@ def with_seats(
 ) -> LiftingNetwork:
     """Return a network that was fitted on, to pieces of recordings in some of which people sit.
 
-    Its parameters are midway between those of the first fit and those of the second, as of Wortsman et al.,
-    "Robust fine-tuning of zero-shot models" (CVPR 2022): those of the second alone take people with short
-    legs who stand for people who sit.
+    Its parameters are midway between those before and after, as of Wortsman et al., "Robust fine-tuning of
+    zero-shot models" (CVPR 2022): those after it alone take people with short legs who stand for people who
+    sit.
 
     Args:
-        network: of the first fit, changed in place. shares: as of `LiftingExamples`.
+        network: of the earlier fits, changed in place. shares: as of `LiftingExamples`.
         steps: of AdamW. seed: of pieces, the next one is taken.
     """
-    first = {name: value.clone() for name, value in network.state_dict().items()}
-    draw = LiftingExamples(shares, seed + 1, _SEAT_SHARE)
-    train_lifter(network, _loss(network, draw), steps, "people who sit", _SEAT_RATE)
-    second = network.state_dict()
-    network.load_state_dict({name: (first[name] + second[name]) / 2 for name in first})
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    draw = LiftingExamples(shares, seed + 1, _SEAT_SHARE, any_rate=True)
+    train_lifter(network, _loss(network, draw), steps, "people who sit", _LATER_RATE)
+    after = network.state_dict()
+    network.load_state_dict({name: (before[name] + after[name]) / 2 for name in before})
     return network.requires_grad_(False)
 
 

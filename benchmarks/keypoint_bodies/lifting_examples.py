@@ -5,6 +5,9 @@ the person, the others anywhere around, 2.5 to 5.5 m away. Some move their arms 
 recordings have few actions. In some legs or arms are not seen at all: people stand behind tables and at the
 border of the image. Every second piece is mirrored. Some sit (`seats`), in front of
 cameras that may be nearer and higher, and often behind a desk.
+
+Sets of recordings have a frame rate each, and a network that is told the rate takes it for the set. So
+pieces may be taken at rates that are drawn anew for each of them.
 """
 
 from __future__ import annotations
@@ -44,6 +47,7 @@ _LEGS = 2  # kinds of hidden joints, the first ones
 _SHARE_HIDDEN, _SHARE_AT_DESK = 0.25, 0.4  # of the pieces, and of those in which people sit
 _NEARER, _HIGHER, _CLEAR_OF_SEAT = 1.0, 0.3, 1.3  # metres, of cameras that see people who sit
 _ARMS_OF_OTHERS = 0.3  # share of the pieces
+_SLOWEST, _FASTEST = 12.0, 60.0  # frames per second that are drawn
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
 _ARMS = [
     [BODY_15.joint(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
@@ -74,7 +78,8 @@ class LiftingExamples:
 
     Args:
         sets: their share of the pieces, and the recordings, of each. seed: of all that is drawn.
-        seats: share of the pieces in which people sit.
+        seats: share of the pieces in which people sit. any_rate: draw the frame rate of each piece, whatever
+            that of its recording is.
     """
 
     def __init__(
@@ -82,13 +87,14 @@ class LiftingExamples:
         sets: Sequence[tuple[float, Sequence[MocapClip]]],
         seed: int = 0,
         seats: float = 0.0,
+        any_rate: bool = False,
     ) -> None:
         self.pool = [_recording(clip) for _, clips in sets for clip in clips]
         shares = [share / sum(map(len, clips)) for share, clips in sets for _ in clips]
         self.lengths = [len(one.joints) for one in self.pool]
         self.weights = torch.tensor(shares) * torch.tensor(self.lengths)
         self.generator = torch.Generator().manual_seed(seed)
-        self.seats = seats
+        self.seats, self.any_rate = seats, any_rate
 
     def __call__(self) -> tuple[Float[Tensor, "N T F"], Float[Tensor, "N T 15 3"]]:
         """Return features, and joints from the pelvis in the axes of the camera, metres."""
@@ -114,11 +120,16 @@ class LiftingExamples:
         """Return pieces of the recordings."""
         given = (self.weights, self.lengths, _FRAMES, _SEQUENCES, self.generator)
         pieces = [(self.pool[i], rows) for i, rows in draw_pieces(*given)]
-        joints = torch.stack([one.joints[rows] for one, rows in pieces])
+        fps = [one.fps for one, _ in pieces]
+        if self.any_rate:
+            share = self._uniform(_SEQUENCES)
+            fps = (_SLOWEST * (_FASTEST / _SLOWEST) ** share).tolist()
+        given_at = zip(pieces, fps, strict=True)
+        joints = torch.stack([_at_rate(one, int(rows[0]), rate) for (one, rows), rate in given_at])
         up, left = (
             torch.stack(x) for x in zip(*((one.up, one.left) for one, _ in pieces), strict=True)
         )
-        return _Pieces(joints, up, left, tuple(one.fps for one, _ in pieces))
+        return _Pieces(joints, up, left, tuple(fps))
 
     def _with_arms_of_others(self, joints: Float[Tensor, "N T 15 3"]) -> Float[Tensor, "N T 15 3"]:
         """Return bodies, some of which have the arms of another piece, in the axes of their trunks."""
@@ -184,6 +195,20 @@ class LiftingExamples:
 def _recording(clip: MocapClip) -> _Recording:
     left = mean_left(clip.joints, clip.up)
     return _Recording(clip.joints.float(), clip.up.float(), left.float(), clip.fps)
+
+
+def _at_rate(recording: _Recording, first: int, fps: float) -> Float[Tensor, "T 15 3"]:
+    """Return a piece from a frame on, at a frame rate; it ends in the last frame of a short recording."""
+    last = len(recording.joints) - 1
+    step = recording.fps / fps
+    first = min(first, max(0, last - math.ceil(step * (_FRAMES - 1))))
+    place = (first + step * torch.arange(_FRAMES)).clamp_max(last)
+    before = place.floor().long()
+    return torch.lerp(
+        recording.joints[before],
+        recording.joints[(before + 1).clamp_max(last)],
+        (place - before)[:, None, None],
+    )
 
 
 def with_arms(

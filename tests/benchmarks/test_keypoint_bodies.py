@@ -28,7 +28,7 @@ from benchmarks.keypoint_bodies.clips import (
 from benchmarks.keypoint_bodies.joint_filters import project_one
 from benchmarks.keypoint_bodies.lifters import placed
 from benchmarks.keypoint_bodies.lifting import fit_shipped
-from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples
+from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples, _at_rate, _recording
 from benchmarks.keypoint_bodies.methods import METHODS, OURS
 from benchmarks.keypoint_bodies.real import predicted, read_filmed
 from benchmarks.keypoint_bodies.scoring import Estimate, bone_spread, score
@@ -279,6 +279,28 @@ def test_nobody_sits_unless_seats_are_asked_for_and_then_desks_hide_more_legs(wa
         hidden.append((there == 0).all(1).float().mean())
     assert drops[0] > 0.7 > 0.55 > drops[1]  # metres, downwards in the image
     assert hidden[0] < 0.25 < 0.35 < hidden[1]
+
+
+def test_frame_rates_of_pieces_are_drawn_if_that_is_asked_for(walker):
+    own, any_rate = (LiftingExamples([(1.0, [walker])], 0, any_rate=x)()[0] for x in (False, True))
+    rates = [60 * seen[..., -1] for seen in (own, any_rate)]
+    assert rates[0].unique().tolist() == [walker.fps]
+    assert len(rates[1][:, 0].unique()) > 10
+    assert bool((rates[1] == rates[1][:, :1]).all())
+
+
+@pytest.mark.parametrize("step", [0.5, 2.0])
+def test_a_piece_at_another_rate_is_of_the_recording_in_the_same_time(walker, step):
+    recording = _recording(walker)
+    piece = _at_rate(recording, 3, walker.fps / step)
+    last = len(recording.joints) - 1
+    first = min(3, max(0, last - math.ceil(47 * step)))
+    place = (first + step * torch.arange(48)).clamp_max(last)
+    whole = place == place.round()
+    torch.testing.assert_close(piece[whole], recording.joints[place[whole].long()])
+    middle = place[~whole].long()
+    between = (recording.joints[middle] + recording.joints[middle + 1]) / 2
+    torch.testing.assert_close(piece[~whole], between)
 
 
 def test_heights_of_cameras_are_told_rightly_and_wrongly(walker):
