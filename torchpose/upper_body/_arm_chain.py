@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpose._core.module_state import outside_inference
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._direction_density import DirectionDensity
-from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, take_rows
+from torchpose.upper_body._limb_nodes import LimbNodes, nodes_anywhere, nodes_on_ray, take_rows
 from torchpose.upper_body._torso_occlusion import log_in_view
 
 _ANGLES = 17  # of a bone whose end is measured
@@ -168,45 +168,35 @@ class ArmChain:
             sizes: the number of nodes of either bone. count: that of hypotheses. rows: the arms that are
                 meant, which come as those of a single body; None is all of them.
         """
-        elbow, hand = ends
-
-        def meant(values: Float[Tensor, "B 2 *rest"]) -> Tensor:
-            return values if rows is None else values.flatten(0, 1)[rows][None]
-
-        shoulder, rays, lengths, variance = map(
-            meant, (arm.shoulder, arm.rays, arm.lengths, arm.variance)
-        )
-        if elbow:
-            std = variance[..., 0].sqrt()
-            upper = nodes_on_ray(shoulder, rays[..., 0, :], lengths[..., 0], std, sizes[0])
-        else:  # the elbow is known as well as its directions are dense
-            axes = meant(_axes_of_spheres(arm.axes))
-            upper = nodes_anywhere(shoulder, lengths[..., 0], axes, sizes[0])
-            grain = (4 * math.pi / sizes[0] / 12) * lengths[..., :1].square()
-            variance = variance + grain
-        start, length = upper.ends, lengths[..., 1, None]
-        if hand:
-            std = variance[..., 1, None].sqrt()
-            lower = nodes_on_ray(start, rays[..., None, 1, :], length, std, sizes[1])
-        else:
-            axes = meant(_axes_of_spheres(arm.axes))[..., None, :, :]
-            lower = nodes_anywhere(start, length, axes, sizes[1])
+        upper, variance = _upper_nodes(arm, ends[0], sizes[0], rows)
+        lower = _lower_nodes(arm, ends[1], sizes[1], (upper, variance), rows)
         weight = upper.log_weight[..., None] + lower.log_weight
-        if not hand and arm.borders is not None and arm.log_inside is not None:
-            borders, log_inside = meant(arm.borders)[..., None, :, :], meant(arm.log_inside)
+        if not ends[1] and arm.borders is not None and arm.log_inside is not None:
+            borders = _taken(arm.borders, rows)[..., None, :, :]
+            log_inside = _taken(arm.log_inside, rows)[..., None, None]
             weight = weight + log_beyond(
-                lower.ends, borders[..., :-1, :], borders[..., -1, :], log_inside[..., None, None]
+                lower.ends, borders[..., :-1, :], borders[..., -1, :], log_inside
             )
-        if elbow and hand:
-            places = torch.cat([start, lower.ends.flatten(-3, -2)], -2)
-            in_view = log_in_view(places, shoulder, meant(arm.middle))
+        if all(ends):
+            places = torch.cat([upper.ends, lower.ends.flatten(-3, -2)], -2)
+            in_view = log_in_view(places, upper.start, _taken(arm.middle, rows))
             of_elbow, of_hand = in_view.tensor_split(sizes[:1], -1)
             weight = weight + of_elbow[..., None] + of_hand.view(weight.shape)
-        weight = weight.flatten(-2)
-        uppers = upper.directions.expand_as(start)
+        return self._likeliest(upper, lower, weight.flatten(-2), count)
+
+    def _likeliest(
+        self, upper: LimbNodes, lower: LimbNodes, weight: Float[Tensor, "*batch N"], count: int
+    ) -> Arms:
+        """Return the hypotheses of largest weight, that of the prior included.
+
+        Args:
+            upper, lower: the nodes of both bones. weight: the log of the likelihood of all their pairs.
+            count: the number of hypotheses, at most.
+        """
+        uppers = upper.directions.expand_as(upper.ends)
         prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
         if weight.shape[-1] <= count:
-            shape = *start.shape[:-1], sizes[1], 3
+            shape = *upper.ends.shape[:-1], len(lower.turns), 3
             bones = uppers[..., None, :], lower.directions
             directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
             return Arms(directions, weight, prior)
@@ -344,6 +334,52 @@ class ArmChain:
         far = torch.baddbmm(same, before, after.mT, alpha=-unit / (2 * scale))
         # in place: memory for as many numbers again takes longer than the arithmetic
         return far.square_().pow_(-2)
+
+
+def _taken(values: Float[Tensor, "B 2 *rest"], rows: Int[Tensor, " A"] | None) -> Tensor:
+    """Return values of some arms as those of a single body, or of all arms as they are."""
+    return values if rows is None else values.flatten(0, 1)[rows][None]
+
+
+def _upper_nodes(
+    arm: ArmInput, measured: bool, count: int, rows: Int[Tensor, " A"] | None
+) -> tuple[LimbNodes, Tensor]:
+    """Return nodes of upper arms, and the variance across the rays of elbow and hand given one of them.
+
+    Args:
+        arm, rows: as of `ArmChain._weighed`. measured: whether the elbow is. count: the number of nodes.
+    """
+    shoulder, lengths, variance = (
+        _taken(values, rows) for values in (arm.shoulder, arm.lengths, arm.variance)
+    )
+    if measured:
+        ray, std = _taken(arm.rays, rows)[..., 0, :], variance[..., 0].sqrt()
+        return nodes_on_ray(shoulder, ray, lengths[..., 0], std, count), variance
+    axes = _taken(_axes_of_spheres(arm.axes), rows)
+    grain = (4 * math.pi / count / 12) * lengths[..., :1].square()  # elbows are as dense as that
+    return nodes_anywhere(shoulder, lengths[..., 0], axes, count), variance + grain
+
+
+def _lower_nodes(
+    arm: ArmInput,
+    measured: bool,
+    count: int,
+    upper: tuple[LimbNodes, Tensor],
+    rows: Int[Tensor, " A"] | None,
+) -> LimbNodes:
+    """Return nodes of forearms from each node of the upper arms.
+
+    Args:
+        arm, rows: as of `ArmChain._weighed`. measured: whether the hand is. count: the number of nodes.
+        upper: what `_upper_nodes` returns.
+    """
+    nodes, variance = upper
+    length = _taken(arm.lengths, rows)[..., 1, None]
+    if measured:
+        ray, std = _taken(arm.rays, rows)[..., None, 1, :], variance[..., 1, None].sqrt()
+        return nodes_on_ray(nodes.ends, ray, length, std, count)
+    axes = _taken(_axes_of_spheres(arm.axes), rows)[..., None, :, :]
+    return nodes_anywhere(nodes.ends, length, axes, count)
 
 
 def _given_later(state: ArmState, message: Float[Tensor, "B 2 N"]) -> ArmState:
