@@ -16,12 +16,12 @@ from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
 from torchpose.math._gaussian import safe_cholesky
-from torchpose.math._rotations import cross_matrix, rotvec_to_matrix
+from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     LEAST_DEPTH,
     NOISE_SCALES,
@@ -30,6 +30,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     KeypointFrame,
     RigMaps,
     Seen,
+    Weighed,
     readings_of,
     squared_errors,
     weigh,
@@ -97,7 +98,12 @@ class Adjusted(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Holds factors of W [T, J, 3, 3], E [T, J, 3, 7 C], b [T, J, 3], S [7 C, 7 C] and g [T, J, 7 C]."""
+    """Holds the normal equations of joints and of the errors of the F cameras that have free ones.
+
+    Attributes:
+        chol: factors of W [T, J, 3, 3]. E: [T, J, 3, 7 F]. b: [T, J, 3, 1]. S: [7 F, 7 F].
+        g: [T, J, 7 F].
+    """
 
     chol: Tensor
     E: Tensor
@@ -125,82 +131,100 @@ def adjust(
     """
     values, joints = start.values, given.joints
     scale = values.new_ones(len(rig))
-    prior, free = _information(given), given.free.flatten()
+    readings, maps = readings_of(given.frames, given.exchange), RigMaps.of(rig)
+    cameras = given.free.any(-1).nonzero().squeeze(-1)
+    prior, free = _information(given, len(cameras)), given.free[cameras].flatten()
     joint_cov: Tensor | None = None
     for width in widths:
-        equations, scale = _equations(rig, given, values, joints, joint_cov, scale, width, prior)
-        chol, E, b, S, g = equations
+        seen, by_errors = _seen(rig, values, joints, given.velocity, given.shifts, cameras)
+        weighed, scale = _weighed(given, readings, maps, seen, joint_cov, scale, width)
+        chol, E, b, S, g = _equations(given, seen, by_errors, weighed, joints, prior, cameras)
         L = safe_cholesky(S[free][:, free])
-        pull = g.sum((0, 1)) - prior * values.flatten()
+        pull = g.sum((0, 1)) - prior * values[cameras].flatten()
         step = torch.zeros_like(pull)
         step[free] = torch.cholesky_solve(pull[free, None], L).squeeze(-1)
-        moved = torch.cholesky_solve(b[..., None] - (E @ step)[..., None], chol).squeeze(-1)
-        values, joints = values + step.view_as(values), joints + moved
+        moved = torch.cholesky_solve(b - E @ step[:, None], chol).squeeze(-1)
+        values = values.index_add(0, cameras, step.view(-1, N_ERRORS))
+        joints = joints + moved
         joint_cov = torch.cholesky_inverse(chol)
     cov = torch.zeros_like(start.cov)
-    rows = free.nonzero().squeeze(-1)
+    rows = given.free.flatten().nonzero().squeeze(-1)
     cov[rows[:, None], rows] = _covariance(given, g[..., free], prior[free], L)
-    spent = (prior * values.flatten().square())[free].sum() / 2
+    spent = (prior * values[cameras].flatten().square())[free].sum() / 2
     narrowed = L.diagonal().log().sum() - prior[free].log().sum() / 2
     return Adjusted(CameraErrors(values, cov), float(spent + narrowed))
 
 
-def _information(given: BundleInputs) -> Float[Tensor, " C7"]:
+def _information(given: BundleInputs, n_cameras: int) -> Float[Tensor, " F7"]:
     """Return the information of the prior about errors."""
     std = [ROTATION_STD] * 3 + [SHIFT_STD] * 3 + [given.delay_std]
-    return torch.tensor(std).to(given.joints).square().reciprocal().repeat(len(given.free))
+    return torch.tensor(std).to(given.joints).square().reciprocal().repeat(n_cameras)
+
+
+def _weighed(
+    given: BundleInputs,
+    readings: KeypointFrame,
+    maps: RigMaps,
+    seen: Seen,
+    joint_cov: Tensor | None,
+    scale: Float[Tensor, " C"],
+    width: float,
+) -> tuple[Weighed, Float[Tensor, " C"]]:
+    """Return the weights of keypoints, and the next factors of the cameras' noise."""
+    count, n_cameras = given.frames.inlier.shape[:2]
+    beliefs = Beliefs(scale.new_full((count, n_cameras, 2), _EXCHANGED), scale.expand(count, -1))
+    weighed = weigh(
+        readings, seen, maps, beliefs, given.exchange, joint_cov, decide=width < 2, width=width
+    )
+    if joint_cov is None:
+        return weighed, scale
+    sums, number = squared_errors(readings, seen, weighed, joint_cov)
+    ratio = sums.sum(0) / number.sum(0).clamp_min(1e-6) * width
+    return weighed, (scale * ratio).clamp(*NOISE_SCALES)
 
 
 def _equations(
-    rig: CameraRig,
     given: BundleInputs,
-    values: Tensor,
-    joints: Tensor,
-    joint_cov: Tensor | None,
-    scale: Tensor,
-    width: float,
-    prior: Tensor,
-) -> tuple[_Equations, Float[Tensor, " C"]]:
-    """Return the normal equations with joints eliminated, and the next factors of the cameras' noise."""
-    frames = given.frames
-    seen, by_errors = _seen(rig, values, joints, given.velocity, given.shifts)
-    count = len(frames.pixels)
-    maps = RigMaps.of(rig)
-    beliefs = Beliefs(scale.new_full((count, len(rig), 2), _EXCHANGED), scale.expand(count, -1))
-    cov = joints.new_zeros(*joints.shape, 3) if joint_cov is None else joint_cov
-    readings = readings_of(frames, given.exchange)
-    weighed = weigh(
-        readings, seen, maps, beliefs, given.exchange, cov, decide=width < 2, width=width
-    )
-    sums, number = squared_errors(readings, seen, weighed, cov)
-    ratio = sums.sum(0) / number.sum(0).clamp_min(1e-6) * width
-    scale = (scale * ratio).clamp(*NOISE_SCALES) if joint_cov is not None else scale
-    w = (weighed.own / weighed.variance)[..., None, None]
-    A, r = seen.by_joint, (frames.pixels - seen.pixels)[..., None]
-    Aw, Bw = (w * A).mT, (w * by_errors).mT
-    W = (Aw @ A).sum(1) + torch.eye(3).to(A) / _JOINT_STD**2
-    b = (Aw @ r).sum(1).squeeze(-1) + (given.joints - joints) / _JOINT_STD**2
-    E = (Aw @ by_errors).permute(0, 2, 3, 1, 4).flatten(-2)
-    chol = torch.linalg.cholesky(W)
-    X = torch.linalg.solve_triangular(chol, E, upper=False)
-    own = torch.block_diag(*(Bw @ by_errors).sum((0, 2)))
-    S = own + torch.diag(prior) - torch.einsum("tjia,tjib->ab", X, X)
-    g = (Bw @ r).squeeze(-1).transpose(1, 2).flatten(-2)
-    g = g - (E.mT @ torch.cholesky_solve(b[..., None], chol)).squeeze(-1)
-    return _Equations(chol, E, b, S, g), scale
+    seen: Seen,
+    by_errors: Float[Tensor, "T F J 2 7"],
+    weighed: Weighed,
+    joints: Float[Tensor, "T J 3"],
+    prior: Float[Tensor, " F7"],
+    cameras: Int[Tensor, " F"],
+) -> _Equations:
+    """Return the normal equations with joints eliminated."""
+    root = (weighed.own / weighed.variance).sqrt()[..., None]
+    A, r = root[..., None] * seen.by_joint, root * (given.frames.pixels - seen.pixels)
+    B = root[:, cameras, ..., None] * by_errors
+    E = (A[:, cameras].mT @ B).permute(0, 2, 3, 1, 4).flatten(-2)
+    g = (r[:, cameras, ..., None, :] @ B).squeeze(-2).transpose(1, 2).flatten(-2)
+    A, r = A.transpose(1, 2).flatten(2, 3), r.transpose(1, 2).flatten(2)[..., None]
+    b = A.mT @ r + (given.joints - joints)[..., None] / _JOINT_STD**2
+    chol = torch.linalg.cholesky(A.mT @ A + torch.eye(3).to(A) / _JOINT_STD**2)
+    solved = torch.linalg.solve_triangular(chol, torch.cat([E, b], -1), upper=False)
+    X, y = solved[..., :-1], solved[..., -1:]
+    B, X_rows = B.transpose(0, 1).flatten(1, 3), X.flatten(0, 2)
+    S = torch.block_diag(*(B.mT @ B)) + torch.diag(prior) - X_rows.T @ X_rows
+    return _Equations(chol, E, b, S, g - (X.mT @ y).squeeze(-1))
 
 
 def by_pose(rig: CameraRig, joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T C J 2 6"]:
     """Return the derivative of pixels by rotation and shift of the cameras that see them."""
     none = CameraErrors.none(rig).values
-    seen = _seen(rig, none, joints, torch.zeros_like(joints), none[:, 0])
-    return seen[1][..., : N_ERRORS - 1]
+    every = torch.arange(len(rig), device=none.device)
+    _, by_errors = _seen(rig, none, joints, torch.zeros_like(joints), none[:, 0], every)
+    return by_errors[..., : N_ERRORS - 1]
 
 
 def _seen(
-    rig: CameraRig, values: Tensor, joints: Tensor, velocity: Tensor, shifts: Tensor
-) -> tuple[Seen, Float[Tensor, "T C J 2 7"]]:
-    """Return joints as cameras see them, and the derivative by the cameras' errors."""
+    rig: CameraRig,
+    values: Float[Tensor, "C 7"],
+    joints: Float[Tensor, "T J 3"],
+    velocity: Float[Tensor, "T J 3"],
+    shifts: Float[Tensor, " C"],
+    cameras: Int[Tensor, " F"],
+) -> tuple[Seen, Float[Tensor, "T F J 2 7"]]:
+    """Return joints as cameras see them, and for some cameras the derivative by their errors."""
     R, t = corrected_pose(rig, values)
     late = (values[:, 6] - shifts)[:, None, None]
     moved = joints[:, None] - late * velocity[:, None]
@@ -208,15 +232,23 @@ def _seen(
     depth = X[..., 2]
     in_front = depth > LEAST_DEPTH
     depth = torch.where(in_front, depth, 1.0)[..., None]
-    homogeneous = X @ rig.matrix.mT
-    pixels = homogeneous[..., :2] / depth
-    K = rig.matrix[:, None]
-    by_point = (K[..., :2, :] - pixels[..., None] * K[..., 2:, :]) / depth[..., None]
-    by_joint = by_point @ R[:, None]
-    turned = X - values[:, None, 3:6]
-    by_turn = -by_point @ cross_matrix(turned)
-    by_delay = -by_joint @ velocity[:, None, ..., None]
+    pixels = (X @ rig.matrix.mT)[..., :2] / depth
+    by_joint = _by_point(rig.matrix @ R, pixels, depth)
+    by_point = _by_point(rig.matrix[cameras], pixels[:, cameras], depth[:, cameras])
+    turned = X[:, cameras] - values[cameras, None, 3:6]
+    by_turn = torch.linalg.cross(turned[..., None, :], by_point)
+    by_delay = -(by_joint[:, cameras] * velocity[:, None, :, None]).sum(-1, keepdim=True)
     return Seen(pixels, by_joint, in_front), torch.cat([by_turn, by_point, by_delay], -1)
+
+
+def _by_point(
+    matrix: Float[Tensor, "C 3 3"],
+    pixels: Float[Tensor, "T C J 2"],
+    depth: Float[Tensor, "T C J 1"],
+) -> Float[Tensor, "T C J 2 3"]:
+    """Return the derivative of pixels by points, whose homogeneous pixels are M p + m."""
+    rows = matrix[:, None, :2] - pixels[..., None] * matrix[:, None, 2:]
+    return rows / depth[..., None]
 
 
 def _covariance(

@@ -47,6 +47,7 @@ def doubt_cameras(
     joints: Float[Tensor, "T J 3"],
     fps: float,
     exchange: Exchange,
+    turns: bool = True,
 ) -> CameraDoubts:
     """Return by what cameras seem to be wrong, from one adjustment about the tracked joints.
 
@@ -55,21 +56,23 @@ def doubt_cameras(
 
     Args:
         rig: two cameras or more. frames: keypoints [T, C, J]. joints: tracked. fps: frames per second.
-        exchange: of sides.
+        exchange: of sides. turns: whether turns are looked for, else they are 0.
     """
     stride = max(1, len(joints) // _FRAMES)
     joints = _averaged(joints, max(1, round(_WINDOW * fps) // 2))
     none = CameraErrors.none(rig)
     start = none.values[:, DELAY]
 
-    def adjusted(free: Tensor) -> CameraErrors:
-        given = given_for(frames, joints, start, free, fps, exchange, stride)
-        return adjust(rig, given, none, _WIDTHS).errors
+    every = free_errors(len(rig), "both")
+    given = given_for(frames, joints, start, every, fps, exchange, stride)
 
-    together = adjusted(free_errors(len(rig), "both"))
-    turns, sigmas = torch.zeros_like(start), torch.zeros_like(start)
+    def adjusted(free: Tensor) -> CameraErrors:
+        return adjust(rig, given._replace(free=free), none, _WIDTHS).errors
+
+    together = adjusted(every)
+    angles, sigmas = torch.zeros_like(start), torch.zeros_like(start)
     there = frames.inlier[::stride] > 0
-    for c in range(len(rig)):
+    for c in range(len(rig) if turns else 0):
         free = torch.zeros(len(rig), DELAY + 1, dtype=torch.bool)
         free[c] = True
         found = adjusted(free)
@@ -78,11 +81,11 @@ def doubt_cameras(
         if not len(moves):
             continue
         moved = (moves @ error[:DELAY]).norm(dim=-1).square().mean().sqrt()
-        turns[c] = torch.rad2deg(moved / rig.matrix[c].diagonal()[:2].mean())
+        angles[c] = torch.rad2deg(moved / rig.matrix[c].diagonal()[:2].mean())
         pose, cov = error[:DELAY, None], found.cov[rows, rows]
         chi = (pose.mT @ torch.cholesky_solve(pose, torch.linalg.cholesky(cov))).sum()
         sigmas[c] = (chi / DELAY).sqrt()
-    return CameraDoubts(together.values[:, DELAY], together.std[:, DELAY], turns, sigmas)
+    return CameraDoubts(together.values[:, DELAY], together.std[:, DELAY], angles, sigmas)
 
 
 def notes_on_cameras(names: Sequence[str], doubts: CameraDoubts) -> tuple[str, ...]:
