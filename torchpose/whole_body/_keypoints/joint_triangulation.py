@@ -28,25 +28,21 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
     Args:
         maps: the cameras. frame: the keypoints.
     """
-    equations = _equations(maps, frame)
+    normal, right = _normal_equations(maps, frame)
     there = frame.inlier > 0
-
-    def solve(use: Tensor) -> Tensor:
-        return _solved(*equations, use)
-
     best = torch.full_like(frame.variance[:, 0], -1.0)
     chosen = torch.zeros_like(there)
-    for pair in combinations(range(len(maps.shift)), 2):
-        use = torch.zeros_like(there)
-        use[:, list(pair)] = there[:, list(pair)].all(1, keepdim=True)
-        seen = see(maps, solve(use))
+    for a, b in combinations(range(len(maps.shift)), 2):
+        both = (there[:, a] & there[:, b])[..., None]
+        pair = normal[:, a] + normal[:, b], right[:, a] + right[:, b]
+        seen = see(maps, _solved(both[..., None] * pair[0], both * pair[1]))
         variance = frame.variance + frame.relative * seen.by_joint.square().sum((-2, -1)) / 2
         error = (seen.pixels - frame.pixels).square().sum(-1) / variance
         agree = there & seen.in_front & (error < _AGREE**2)
         score = (
             agree.to(error) - torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
         ).sum(1)
-        score = torch.where((agree & use).sum(1) == 2, score, -1.0)
+        score = torch.where(agree[:, a] & agree[:, b], score, -1.0)
         chosen = torch.where((score > best)[:, None], agree, chosen)
         best = torch.maximum(best, score)
     return chosen
@@ -87,23 +83,24 @@ def triangulate_all(
     Args:
         maps: the cameras. frame: the keypoints. use: which of them count.
     """
-    return _solved(*_equations(maps, frame), use)
+    normal, right = _normal_equations(maps, frame)
+    count = use.to(right)[..., None]
+    return _solved((count[..., None] * normal).sum(1), (count * right).sum(1))
 
 
-def _equations(
+def _normal_equations(
     maps: RigMaps, frame: KeypointFrame
-) -> tuple[Float[Tensor, "B C J 2 3"], Float[Tensor, "B C J 2"]]:
-    """Return rows and right sides of linear equations of the joints."""
+) -> tuple[Float[Tensor, "B C J 3 3"], Float[Tensor, "B C J 3"]]:
+    """Return what each camera adds to the normal equations of the joints."""
     rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
     right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
     size = maps.matrix[:, 2].norm(dim=-1)[:, None, None]
-    return rows / size[..., None], right / size
+    rows, right = rows / size[..., None], right / size
+    return rows.mT @ rows, (rows.mT @ right[..., None]).squeeze(-1)
 
 
 def _solved(
-    rows: Float[Tensor, "B C J 2 3"], right: Float[Tensor, "B C J 2"], use: Bool[Tensor, "B C J"]
+    normal: Float[Tensor, "B J 3 3"], right: Float[Tensor, "B J 3"]
 ) -> Float[Tensor, "B J 3"]:
     """Return the joints of least squares."""
-    scaled = rows * use.to(rows)[..., None, None]
-    normal = (scaled.mT @ rows).sum(1) + 1e-9 * torch.eye(3).to(rows)
-    return torch.linalg.solve(normal, (scaled.mT @ right[..., None]).sum(1)).squeeze(-1)
+    return torch.linalg.solve(normal + 1e-9 * torch.eye(3).to(normal), right)

@@ -184,15 +184,13 @@ def weigh(
         decide: whether keypoints tell about exchanged sides; else the prior alone does.
         width: factor of the noise's variance.
     """
-    spread = None
-    if joint_cov is not None:
-        spread = seen.by_joint @ joint_cov.unsqueeze(-4) @ seen.by_joint.mT
     size = 0.5 * seen.by_joint.square().sum((-2, -1))  # about f^2 / depth^2
     scale = (width * beliefs.scale)[..., None]
     variance = scale * (readings.variance + readings.relative * size)
     inlier, there = readings.inlier, readings.inlier > 0
     present = there & seen.in_front
-    density = _log_density(readings.pixels - seen.pixels, spread, variance, marginal)
+    off = readings.pixels - seen.pixels
+    density = _log_density(off, seen.by_joint, joint_cov, variance, marginal)
     log_in = inlier.clamp_min(_LEAST).log() + density
     log_out = torch.log1p(-inlier) - maps.log_area[:, None]
     either = torch.where(seen.in_front, torch.logaddexp(log_in, log_out), log_out)
@@ -216,14 +214,15 @@ def weigh(
 
 
 def _log_density(
-    residual: Tensor, spread: Tensor | None, variance: Tensor, marginal: bool
+    residual: Tensor, by_joint: Tensor, joint_cov: Tensor | None, variance: Tensor, marginal: bool
 ) -> Tensor:
-    """Return log N(r; 0, spread + R), or log N(r; 0, R) expected over the spread; R = variance I."""
-    if spread is None or not marginal:
+    """Return log N(r; 0, A P A^T + R), or log N(r; 0, R) expected over A P A^T; R = variance I."""
+    if joint_cov is None or not marginal:
         square = residual.square().sum(-1)
-        if spread is not None:
-            square = square + spread.diagonal(dim1=-2, dim2=-1).sum(-1)
+        if joint_cov is not None:
+            square = square + _mean_square(by_joint, joint_cov)
         return -0.5 * square / variance - (2 * math.pi * variance).log()
+    spread = by_joint @ joint_cov.unsqueeze(-4) @ by_joint.mT
     a, b, d = spread[..., 0, 0] + variance, spread[..., 0, 1], spread[..., 1, 1] + variance
     det = a * d - b * b
     x, y = residual.unbind(-1)
@@ -250,6 +249,13 @@ def squared_errors(
 
     Only keypoints read as of their own joint count, by their weights: E[|r|^2] = |r|^2 + tr A P A^T.
     """
-    spread = (seen.by_joint @ joint_cov.unsqueeze(-4) * seen.by_joint).sum((-2, -1))
+    spread = _mean_square(seen.by_joint, joint_cov)
     square = (readings.pixels[0] - seen.pixels).square().sum(-1) + spread
     return (weighed.own * square / weighed.variance).sum(-1), 2 * weighed.own.sum(-1)
+
+
+def _mean_square(
+    by_joint: Float[Tensor, "B C J 2 3"], joint_cov: Float[Tensor, "B J 3 3"]
+) -> Float[Tensor, "B C J"]:
+    """Return tr A P A^T, of pixels by the covariance of their joints."""
+    return (by_joint @ joint_cov.unsqueeze(-4) * by_joint).sum((-2, -1))
