@@ -20,8 +20,9 @@ from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.whole_body._keypoints import track_builder
 from torchpose.whole_body._keypoints.all_sides import notes_on_all_sides
-from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_order import agree_as_given, notes_on_order
 from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import (
     _corrected,
@@ -314,6 +315,21 @@ def test_another_order_of_the_inputs_is_said(order):
     for camera, given in enumerate(order):
         assert f"input {camera + 1} is of c{given}" in note
     assert notes_on_order(names, maps, right) == ()
+
+
+def test_other_readings_are_tried_only_where_they_can_be_better(three, monkeypatch):
+    given = KeypointBodyTracker(three.rig, FPS).reader.frames(three.keypoints, None, NAMES, None)
+    maps, tried = RigMaps.of(three.rig), []
+    assert agree_as_given(maps, given)
+    assert not agree_as_given(maps, given._replace(pixels=given.pixels[:, [1, 0, 2]]))
+    for name in ("notes_on_order", "notes_on_one_camera"):
+        monkeypatch.setattr(track_builder, name, lambda *_, name=name: tried.append(name) or ())
+    mirrored = three.keypoints[:3].clone()
+    track(mirrored, three.rig)
+    assert tried == []
+    mirrored[:, 1, :, 0] = 1919 - mirrored[:, 1, :, 0]
+    track(mirrored, three.rig)
+    assert tried == ["notes_on_order", "notes_on_one_camera"]
 
 
 @pytest.mark.parametrize("cameras", [3, 4])

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.whole_body._keypoints.joint_triangulation import agreement_of_each
+from torchpose.whole_body._keypoints.joint_triangulation import agreement, agreement_of_each
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 
 _FRAMES = 20  # that are looked at, at most
@@ -36,6 +36,15 @@ def notes_on_order(names: Sequence[str], maps: RigMaps, frames: KeypointFrame) -
         f"keypoints if {fits}{several} and on {100 * float(agreed[0]):.0f} % as they are given; give them "
         "in the order of the cameras",
     )
+
+
+def agree_as_given(maps: RigMaps, frames: KeypointFrame) -> bool:
+    """Return whether cameras agree so well that by no other reading they can agree by `MORE` better.
+
+    Args:
+        maps: the cameras. frames: keypoints [T, C, J].
+    """
+    return float(agreement(maps, some_frames(frames))) + MORE > 1
 
 
 def agreement_of_orders(

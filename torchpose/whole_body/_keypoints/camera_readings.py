@@ -31,8 +31,6 @@ def notes_on_one_camera(
     least = WELL_OF_TWO if len(rig) == 2 else WELL
     some = some_frames(frames)
     given = float(agreement_of_readings(maps, some.map(lambda value: value[:, None]))[0])
-    if given > 1 - MORE:
-        return ()
     readings = list(_readings(rig, some, exchange))
     tried = [_one_by_one(some, other) for _, other in readings]
     side_by_side = KeypointFrame(*(torch.cat(values, 1) for values in zip(*tried, strict=True)))

@@ -14,7 +14,7 @@ from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.all_sides import notes_on_all_sides
 from torchpose.whole_body._keypoints.camera_notes import doubt_cameras, notes_on_cameras
-from torchpose.whole_body._keypoints.camera_order import notes_on_order
+from torchpose.whole_body._keypoints.camera_order import agree_as_given, notes_on_order
 from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import RefinedCameras
 from torchpose.whole_body._keypoints.foot_filter import FootPoses
@@ -141,15 +141,15 @@ class TrackBuilder:
         if len(self.rig) == 1 or not cameras:
             return notes
         maps, exchange = self.tracker.filter.maps, self.tracker.filter.exchange
-        order = notes_on_order(self.rig.names, maps, frame)
         notes = (*notes_on_all_sides(self.tracker.filter, frame), *notes)
-        order = order or notes_on_one_camera(self.rig, maps, frame, exchange)
-        if order:
-            return (*order, *notes)
+        if not agree_as_given(maps, frame):
+            other = notes_on_order(self.rig.names, maps, frame)
+            other = other or notes_on_one_camera(self.rig, maps, frame, exchange)
+            if other:
+                return (*other, *notes)
         rig = self.rig if refined is None else refined.rig
-        doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange)
-        if turned:  # that is said already
-            doubts = doubts._replace(turns=torch.zeros_like(doubts.turns))
+        # turned cameras are said already
+        doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange, turns=not turned)
         return (*notes, *notes_on_cameras(self.rig.names, doubts))
 
 
