@@ -71,6 +71,16 @@ def test_the_low_neck_is_taken_and_middles_stand_in():
     assert float(body_joints(joints, names)[0, 0]) == hips
 
 
+def test_a_head_beside_ears_is_the_crown_unless_a_kinect_has_it():
+    head = BODY_15.joint("head")
+    joints, names = numbered("openpose-25")
+    with_crown = torch.cat([joints, torch.full_like(joints[:1], 99.0)])
+    ears = (names.index("LEar") + names.index("REar")) / 2
+    assert float(body_joints(with_crown, [*names, "Head"])[head, 0]) == ears
+    joints, names = numbered("azure-32")
+    assert names[int(body_joints(joints, names)[head, 0])] == "HEAD"
+
+
 def test_joints_of_other_sets_are_refused():
     joints, names = numbered("upper-body-8")
     with pytest.raises(SkeletonError, match="left_hip, right_hip are not among"):

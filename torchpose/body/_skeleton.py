@@ -388,7 +388,8 @@ def body_joints(
     neck is the low one (CMU lowerneck, v2 SpineShoulder, MHAD neck, HumanEva thorax) where there
     is a choice, since it moves least against the shoulders. Without a pelvis or a neck, the middle
     of hips or shoulders stands for it, and without a head that of the ears (of the one that is known: then
-    a camera sees the head from the side), of the eyes, or the nose.
+    a camera sees the head from the side), of the eyes, or the nose. The head of detectors
+    that find ears as well, of Halpe and BODY_25B, is the crown and is not used; that of an Azure Kinect is.
 
     Args:
         joints: [..., K, C], metres (C = 3) or pixels (C = 2), in any axes.
@@ -417,9 +418,14 @@ def body_joints(
         if found[BODY_15.joint(joint)] is None:
             both = picked[BODY_15.joint(left)], picked[BODY_15.joint(right)]
             picked[BODY_15.joint(joint)] = (both[0] + both[1]) / 2
-    if found[BODY_15.joint("head")] is None:
+    if found[BODY_15.joint("head")] is None or _head_is_crown(canonical):
         picked[BODY_15.joint("head")] = _face(joints, canonical)
     return torch.stack(picked, -2)
+
+
+def _head_is_crown(canonical: Sequence[str]) -> bool:
+    """Return whether a set's head is the crown, as in sets of detectors; a Kinect's set has a chest."""
+    return {"ear_left", "ear_right"} <= {*canonical} and "spine_chest" not in canonical
 
 
 def _face(
