@@ -13,6 +13,7 @@ from torchpose.priors._body_motion import BodyMotion
 
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
+_HELD_STD = 0.002  # of the log of the legs' length in one camera
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
 
 
@@ -44,13 +45,16 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
 def of_one_camera(motion: BodyMotion) -> BodyMotion:
     """Return the prior for one camera, in which nothing tells a small person from a far one.
 
-    The legs together keep the length that is expected. Proportions have the covariance over persons whose
-    legs are equally long.
+    The legs together keep the length that is expected. They would become shorter and shorter, since the
+    network that lifts makes limbs short of whose depth it is unsure. Proportions have the covariance over
+    persons whose legs are equally long.
     """
     told = weights_of_legs(motion)
     cross = motion.scale_cov @ told
     cov = motion.scale_cov - cross[:, None] * cross / (told @ cross)
-    cov = cov + _LENGTH_STD**2 * torch.eye(len(cov)).to(cov)
+    along = told[:, None] * told / (told @ told)
+    free = torch.eye(len(cov)).to(cov) - along
+    cov = cov + _LENGTH_STD**2 * free + _HELD_STD**2 * along
     return _with(motion, {"scale_cov": (cov + cov.mT) / 2})
 
 
