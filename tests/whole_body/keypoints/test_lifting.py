@@ -296,6 +296,17 @@ def test_strangers_are_nearer_than_the_best_still_pose():
         assert error < still
 
 
+def test_a_height_that_is_told_stays():
+    """The network makes limbs short of whose depth it is unsure."""
+    data = data_dir_or_skip(MHAD).parent
+    (clip,) = read_clips(data, {MHAD: ("s10_a05_wave_two_hands_r1",)})[MHAD]
+    one = begun(clip, 60).of_cameras(1)
+    track = torchpose.BodyTracker(one.rig, "kalman", fps=one.fps, height=1.7)(
+        keypoints=one.seen.keypoints, confidence=one.seen.confidence, smoothing="full"
+    )
+    assert track.body.height == pytest.approx(1.7, abs=0.02)
+
+
 @pytest.mark.parametrize("every", [2, 4])
 def test_strangers_who_walk_may_be_filmed_at_half_and_a_quarter_of_the_rate(every):
     data = data_dir_or_skip(WALKS).parent
