@@ -126,7 +126,7 @@ class KeypointBodyTracker(nn.Module):
             motion = with_height(motion, check_height(height))
         size_std = std_of_legs(motion) if alone else 0.0
         if alone:
-            motion = of_one_camera(motion)
+            motion = of_one_camera(motion, told=body is not None or height is not None)
         sized = body is not None or height is not None or camera_height is not None
         lasting = _LASTING_OF_ONE * keypoint_std if alone else 0.0
         self.tracker = KeypointTracker(

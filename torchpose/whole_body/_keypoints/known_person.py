@@ -13,7 +13,7 @@ from torchpose.priors._body_motion import BodyMotion
 
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
-_HELD_STD = 0.002  # of the log of the legs' length in one camera
+_TOLD_STD = 0.002  # of the log of the legs' length, in one camera, of a known person
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
 
 
@@ -42,19 +42,22 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     return _with(motion, {"scale_mean": mean, "scale_cov": (cov + cov.mT) / 2})
 
 
-def of_one_camera(motion: BodyMotion) -> BodyMotion:
+def of_one_camera(motion: BodyMotion, told: bool = False) -> BodyMotion:
     """Return the prior for one camera, in which nothing tells a small person from a far one.
 
-    The legs together keep the length that is expected. They would become shorter and shorter, since the
-    network that lifts makes limbs short of whose depth it is unsure. Proportions have the covariance over
-    persons whose legs are equally long.
+    The legs together keep the length that is expected. Proportions have the covariance over persons whose
+    legs are equally long.
+
+    Args:
+        motion: of the person. told: whether the length of the legs is known. Limbs of whose depth the network
+            that lifts is unsure come out short, and would make the legs short within seconds.
     """
-    told = weights_of_legs(motion)
-    cross = motion.scale_cov @ told
-    cov = motion.scale_cov - cross[:, None] * cross / (told @ cross)
-    along = told[:, None] * told / (told @ told)
-    free = torch.eye(len(cov)).to(cov) - along
-    cov = cov + _LENGTH_STD**2 * free + _HELD_STD**2 * along
+    legs = weights_of_legs(motion)
+    cross = motion.scale_cov @ legs
+    cov = motion.scale_cov - cross[:, None] * cross / (legs @ cross)
+    along = legs[:, None] * legs / (legs @ legs)
+    std = _TOLD_STD if told else _LENGTH_STD
+    cov = cov + _LENGTH_STD**2 * (torch.eye(len(cov)).to(cov) - along) + std**2 * along
     return _with(motion, {"scale_cov": (cov + cov.mT) / 2})
 
 
