@@ -1,8 +1,8 @@
 """Real cameras, each predicted from others: OpenPose's keypoints of a balancing person.
 
 The recording of Pose2Sim has no truth. A method sees one, two or three of its four cameras; its joints are
-projected into each of the others, and compared with what OpenPose found there. OpenPose's head is the top of
-the head, and the pelvis is the middle of its hips.
+projected into each of the others, and compared with what OpenPose found there. The head is the middle of its
+ears, and the pelvis that of its hips.
 """
 
 from __future__ import annotations

@@ -57,7 +57,8 @@ def same(one: PoseTrack, other: PoseTrack) -> None:
 def test_poses_are_those_of_the_library(track, files, tmp_path):
     done, poses = track()
     same(poses, expected(files))
-    arrays = np.load(tmp_path / "out" / "poses.npz")
+    with np.load(tmp_path / "out" / "poses.npz") as stored:
+        arrays = dict(stored)
     shapes = {"joints2d": (8, 2), "joints3d": (8, 3), "covariance3d": (8, 3, 3), "observed": (8,)}
     for key, shape in shapes.items():
         assert arrays[key].shape == (N_FRAMES, *shape)

@@ -132,8 +132,9 @@ def adjust(
     values, joints = start.values, given.joints
     scale = values.new_ones(len(rig))
     readings, maps = readings_of(given.frames, given.exchange), RigMaps.of(rig)
-    cameras = given.free.any(-1).nonzero().squeeze(-1)
-    prior, free = _information(given, len(cameras)), given.free[cameras].flatten()
+    moving = given.free.any(-1)
+    cameras = moving.nonzero().squeeze(-1).to(values.device)
+    prior, free = _information(given, len(cameras)), given.free[moving].flatten()
     joint_cov: Tensor | None = None
     for width in widths:
         seen, by_errors = _seen(rig, values, joints, given.velocity, given.shifts, cameras)
