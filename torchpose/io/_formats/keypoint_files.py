@@ -43,11 +43,15 @@ _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a d
 
 def is_keypoint_header(cells: Sequence[str]) -> bool:
     """Return whether the cells of a first line name frames or x and y alone, or begin DeepLabCut's header."""
-    lower = [cell.lower() for cell in cells]
-    flat = {cell[-2:] for cell in lower}
-    return any(cell in (*_FRAMES, "scorer") for cell in lower) or (
-        flat >= {"_x", "_y"} and "_z" not in flat
-    )
+    if any(cell.lower() in (*_FRAMES, "scorer") for cell in cells):
+        return True
+    ends = _ends(cells)
+    return ends >= {"_x", "_y"} and "_z" not in ends
+
+
+def _ends(cells: Sequence[str]) -> set[str]:
+    """Return the last two characters of the names of columns: "_x" of NAME_x."""
+    return {cell[-2:].lower() for cell in cells}
 
 
 @dataclass
@@ -143,10 +147,8 @@ def _with_frames(path: Path, rows: _Rows) -> _Rows:
     """
     header = rows[0][1]
     time = next((i for i, cell in enumerate(header) if is_time(cell)), None)
-    lower = {cell.lower() for cell in header}
-    if not (
-        {cell[-2:] for cell in lower} >= {"_x", "_y"} or (time is not None and lower >= {"x", "y"})
-    ):
+    long = {"x", "y"} <= {cell.lower() for cell in header}
+    if not (_ends(header) >= {"_x", "_y"} or (time is not None and long)):
         raise FileFormatError(
             f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
             f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"

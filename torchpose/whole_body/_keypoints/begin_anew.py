@@ -18,6 +18,11 @@ def sees_enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:
     return (frame.inlier > 0).sum(-1) >= LEAST_JOINTS
 
 
+def sees_most(frame: KeypointFrame) -> Int[Tensor, " B"]:
+    """Return the camera that sees the most joints, the first of several."""
+    return (frame.inlier > 0).sum(-1).argmax(-1)
+
+
 def may_begin(frame: KeypointFrame, waited: Float[Tensor, " B"], fps: float) -> Bool[Tensor, " B"]:
     """Return whether tracking may begin: two cameras see the same joints, or one for long.
 

@@ -17,6 +17,7 @@ from torchpose.whole_body._keypoints.begin_anew import (
     frames_lost,
     may_begin,
     sees_enough,
+    sees_most,
 )
 from torchpose.whole_body._keypoints.body_kalman import (
     BodyGaussian,
@@ -242,7 +243,7 @@ class KeypointTracker(nn.Module):
         if not bool((pose.started | (stream.alone >= 0)).any()):
             return step
         fresh = pose.started & ~self._triangulated(frame).any(-1) & sees_enough(frame).any(-1)
-        alone = torch.where(fresh, (frame.inlier > 0).sum(-1).argmax(-1), stream.alone)
+        alone = torch.where(fresh, sees_most(frame), stream.alone)
         for camera in alone[alone >= 0].unique().tolist():
             for begins in (True, False):
                 rows = ((alone == camera) & (fresh == begins)).nonzero().squeeze(-1)
@@ -262,7 +263,7 @@ class KeypointTracker(nn.Module):
         enough = sees_enough(frame)
         by_own = enough.gather(1, stream.alone.clamp_min(0)[:, None]).squeeze(1)
         left = (stream.alone >= 0) & ~by_own & enough.any(-1)
-        other = (frame.inlier > 0).sum(-1).argmax(-1)
+        other = sees_most(frame)
         for camera in other[left].unique().tolist():
             rows = (left & (other == camera)).nonzero().squeeze(-1)
             begun = self._by_camera(camera, None, frame.take(rows), taken(step, rows))

@@ -32,6 +32,7 @@ from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.begin_anew import sees_most
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
@@ -166,7 +167,7 @@ class PoseLifter(nn.Module):
         Args:
             lifted: of `forward`. frame: the keypoints.
         """
-        camera = (frame.inlier > 0).sum(-1).argmax(-1)
+        camera = sees_most(frame)
         own = torch.arange(len(camera), device=camera.device), camera
         rotation, translation = self.view.rotation[camera], self.view.translation[camera]
         joints = lifted.joints @ rotation.mT
