@@ -4,7 +4,6 @@ TORCHPOSE_SHAPE_CHECKS=0 switches the shape checks off, for profiling or a debug
 """
 
 import gc
-import inspect
 import os
 import signal
 
@@ -65,10 +64,9 @@ def _coarse_pictures():
     """Pictures have 50 dots per inch where a test asks for no other number: they are drawn faster."""
     from torchpose.viz._style import save_figure
 
-    plain = inspect.unwrap(save_figure)
-    before, plain.__defaults__ = plain.__defaults__, (50,)
+    before, save_figure.__defaults__ = save_figure.__defaults__, (50,)
     yield
-    plain.__defaults__ = before
+    save_figure.__defaults__ = before
 
 
 @pytest.fixture(scope="session")

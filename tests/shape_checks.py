@@ -16,8 +16,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from itertools import compress
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import numpy as np
 from beartype import BeartypeConf, beartype
@@ -77,38 +76,9 @@ def checked(function: Any) -> Any:
         return function
     if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
         return function
-    check = _check_of(function)
-    looked_at, named, returns = check.looked_at, check.named, check.returns
-    plain, passed, most = check.plain, check.passed, len(check.looked_at)
-
-    @functools.wraps(function)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        __tracebackhide__ = True
-        returned = function(*args, **kwargs)
-        # Nearly all calls end here, millions in a run: no call is made that can be left out.
-        try:
-            if len(args) > most:
-                raise TypeError("more values than are told apart")
-            facts: list[Hashable] = [len(args), *map(type, args), type(returned), *kwargs]
-            values = [*compress(args, looked_at)]
-            for name in kwargs:
-                if name in named:
-                    facts.append(type(kwargs[name]))
-                else:
-                    values.append(kwargs[name])
-            if not returns:
-                values.append(returned)
-            if values:
-                _add_facts(values, facts, plain)
-            key = tuple(facts)
-            if key in passed:
-                return returned
-        except TypeError:  # unhashable, as symbolic sizes are
-            key = None
-        check(args, kwargs, returned, key)
-        return returned
-
-    return wrapper
+    wrapper = _check_of(function).wrapper_of(function)
+    wrapper.__defaults__, wrapper.__kwdefaults__ = function.__defaults__, function.__kwdefaults__
+    return functools.wraps(function)(wrapper)
 
 
 _checks: dict[int, tuple[types.CodeType, "_Check"]] = {}
@@ -127,17 +97,25 @@ class _Check:
 
     def __init__(self, function: types.FunctionType) -> None:
         self.function = function
-        code, hints = function.__code__, function.__annotations__
-        names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
-        self.named = {name for name in names if _told_by_type(hints.get(name))}
-        self.looked_at = [name not in self.named for name in names[: code.co_argcount]]
-        if code.co_flags & inspect.CO_VARARGS:
-            self.looked_at += [True] * _MOST_ITEMS
-        self.returns = _told_by_type(hints.get("return"))
+        self.signature = inspect.signature(function)
         self.plain = _PLAIN if _may_have_literals(function) else _PLAIN_AND_WORDS
         self.call: Callable | None = None
         self.being_made = False
         self.passed: set[Hashable] = set()
+        source = _wrapper_source(self.signature, function.__annotations__)
+        names = {"__check": self, "__passed": self.passed, "__facts_of": self.facts_of}
+        exec(_compiled(source), names)
+        self.wrapper_of: Callable[[Callable], types.FunctionType] = names["__wrapper_of"]  # type: ignore[assignment]
+
+    def facts_of(self, *values: Any) -> tuple[Hashable, ...]:
+        """Return what the outcome depends on, of values of which it takes more than the annotation.
+
+        Raises:
+            TypeError: a collection too large to be told from others by its items.
+        """
+        facts: list[Hashable] = []
+        _add_facts(values, facts, self.plain)
+        return tuple(facts)
 
     def __call__(
         self, args: tuple, kwargs: dict[str, Any], returned: Any, key: Hashable | None
@@ -154,9 +132,84 @@ class _Check:
                 return
             self.being_made = True
             self.call = _make_check(self.function)
-        self.call(*args, **kwargs, _returned=returned)
+        given, parameters = self.signature.bind(*args, **kwargs), self.signature.parameters
+        given.arguments = {  # a default may be a mark that is none of what is annotated
+            name: value
+            for name, value in given.arguments.items()
+            if value is not parameters[name].default
+        }
+        self.call(*given.args, **given.kwargs, _returned=returned)
         if key is not None:
             self.passed.add(key)
+
+
+# Nearly all calls end at the first `return`, millions in a run: nothing is done that can be left out.
+_WRAPPER = """
+def __wrapper_of(__function):
+    def wrapper{parameters}:
+        __tracebackhide__ = True
+        __returned = __function({passed_on})
+        try:
+            __key = ({facts},)
+            if __key in __passed:
+                return __returned
+        except (AttributeError, LookupError, TypeError):  # not as annotated, or with symbolic sizes
+            __key = None
+        __check(({by_place}), dict({by_name}), __returned, __key)
+        return __returned
+    return wrapper
+"""
+
+
+@functools.cache
+def _compiled(source: str) -> types.CodeType:
+    return compile(source, f"<{__name__}>", "exec")
+
+
+def _wrapper_source(signature: inspect.Signature, hints: Mapping[str, Any]) -> str:
+    """Return the source of a function of the same parameters, which has new combinations checked."""
+    parameters = signature.parameters.values()
+    bare = [p.replace(annotation=p.empty, default=p.empty) for p in parameters]
+    several = [p.name for p in bare if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    by_place = [p.name for p in bare if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    by_place += [f"*{p.name}" for p in bare if p.kind is p.VAR_POSITIONAL]
+    by_name = [f"{p.name}={p.name}" for p in bare if p.kind is p.KEYWORD_ONLY]
+    by_name += [f"**{p.name}" for p in bare if p.kind is p.VAR_KEYWORD]
+    values = {p.name: _fact(p.name, hints.get(p.name)) for p in bare if p.name not in several}
+    values["__returned"] = _fact("__returned", hints.get("return"))
+    facts = [fact for fact in values.values() if fact is not None]
+    if others := [*several, *(value for value, fact in values.items() if fact is None)]:
+        facts.append(f"__facts_of({', '.join(others)})")
+    return _WRAPPER.format(
+        parameters=inspect.Signature(bare),
+        passed_on=", ".join(by_place + by_name),
+        facts=", ".join(facts),
+        by_place="".join(f"{name}, " for name in by_place),
+        by_name=", ".join(by_name),
+    )
+
+
+def _fact(value: str, hint: Any) -> str | None:
+    """Return the source of what an annotation asks of a value; None if that is not known beforehand."""
+    if _told_by_type(hint):
+        return f"type({value})"
+    of_array = f"type({value}), {value}.dtype, {value}.shape"
+    if _is_array(hint):
+        return of_array
+    if isinstance(hint, types.UnionType) and all(
+        kind is types.NoneType or _is_array(kind) for kind in hint.__args__
+    ):
+        return f"{value} is None or ({of_array})"
+    if get_origin(hint) is tuple:
+        items = [_fact(f"{value}[{i}]", item) for i, item in enumerate(get_args(hint))]
+        known = [item for item in items if item is not None]
+        if len(known) == len(items):
+            return ", ".join([f"type({value})", f"len({value})", *known])
+    return None
+
+
+def _is_array(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, AbstractArray)
 
 
 def _pass_on(*args, _returned, **kwargs):
@@ -192,7 +245,7 @@ def _told_by_type(hint: Any) -> bool:
         return all(map(_told_by_type, hint.__args__))
     if hint is None or hint is Any:
         return True
-    return isinstance(hint, type) and not issubclass(hint, AbstractArray)
+    return isinstance(hint, type) and not _is_array(hint)
 
 
 def _add_facts(values: Iterable[Any], facts: list[Hashable], plain: set[type]) -> None:

@@ -39,9 +39,10 @@ def test_typed_error_of_the_function_wins():
 PACKAGE = '''
 """Functions whose shapes disagree on purpose."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -85,6 +86,16 @@ def turned(x: Float[Tensor, "N"], order: Literal["up", "down"]) -> str:
 
 def called(name: str, parts: list[str]) -> str:
     return name
+
+
+@dataclass
+class Kept:
+    parts: dict[str, Float[Tensor, "N"]] = field(default_factory=dict)
+
+
+def halves(x: Float[Tensor, "N"] | None = None, *, n: int = 2) -> tuple[Float[Tensor, "M"], int]:
+    y = torch.zeros(2) if x is None else x
+    return (y, 1) if len(y) < 4 else (y, 1, 1)
 '''
 
 
@@ -164,6 +175,21 @@ def test_words_are_told_apart_where_an_annotation_lists_them(package):
     for bad in ((1, ["b"]), ("a", [1]), (None, ["b"])):
         with pytest.raises(TypeCheckError):
             package.called(*bad)
+
+
+def test_defaults_are_passed_on_and_marks_among_them_are_no_values(package):
+    assert package.Kept().parts == {} and package.Kept({"a": torch.zeros(2)}).parts.keys() == {"a"}
+    with pytest.raises(TypeCheckError):
+        package.Kept({"a": 1})
+
+
+def test_items_of_results_are_checked_and_what_may_be_none(package):
+    for _ in range(2):
+        assert package.halves()[1] == package.halves(None, n=2)[1] == 1
+        assert len(package.halves(torch.zeros(2))) == 2
+    for bad in (torch.zeros(4), torch.zeros(2, 2), torch.zeros(2).long(), "two"):
+        with pytest.raises(TypeCheckError):
+            package.halves(bad)
 
 
 def test_a_package_that_was_imported_already_is_refused():
