@@ -46,7 +46,7 @@ def pair():
     """Two performers who walk past each other."""
     from benchmarks._performances import crossing
 
-    return crossing(100, seconds=3.0)
+    return crossing(70, seconds=3.0)  # they meet in frame 45
 
 
 @pytest.fixture(scope="module")

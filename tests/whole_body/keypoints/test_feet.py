@@ -58,6 +58,25 @@ def tracked(four):
     return BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=keypoints, names=WITH_FEET)
 
 
+@pytest.fixture(scope="module")
+def spoiled(four):
+    """Tracks of the scene with faults of its keypoints, all in one batch."""
+    shown, _, keypoints = four
+    cases = {name: keypoints.clone() for name in ("blind", "hidden", "wild", "turned", "elsewhere")}
+    cases["blind"][:, :, 15:] = torch.nan
+    cases["hidden"][2:, :, 15:] = torch.nan
+    cases["wild"][10:20, 1, 15:] += 150.0
+    legs = [i for i, n in enumerate(WITH_FEET) if n.split("_")[-1] in ("hip", "knee", "ankle")]
+    moved = legs + list(range(15, 21))
+    other = [WITH_FEET.index(_other(WITH_FEET[i])) for i in moved]
+    cases["turned"][8:20, 2][:, moved] = keypoints[8:20, 2][:, other]
+    cases["elsewhere"][:, 3, :15] = torch.nan
+    tracks = BodyTracker(shown.rig, "kalman", fps=FPS)(
+        keypoints=torch.stack([*cases.values()]), names=WITH_FEET
+    )
+    return dict(zip(cases, tracks, strict=True))
+
+
 def errors(track, feet):
     return 1000 * (track.feet.points3d - feet[track.first_frame :]).norm(dim=-1)
 
@@ -114,11 +133,9 @@ def test_live_there_are_no_feet_before_the_first_pose(four):
     assert bool(pose.feet.points3d.isfinite().all())
 
 
-def test_feet_that_nobody_sees_are_where_legs_let_expect_them(four, tracked):
-    shown, feet, keypoints = four
-    blind = keypoints.clone()
-    blind[:, :, 15:] = torch.nan
-    found = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=blind, names=WITH_FEET)
+def test_feet_that_nobody_sees_are_where_legs_let_expect_them(four, tracked, spoiled):
+    _, feet, _ = four
+    found = spoiled["blind"]
     assert float(found.feet.points_std().min()) > 2 * float(tracked.feet.points_std().mean())
     assert float(errors(found, feet).mean()) < 120
     assert bool((found.feet.inlier == 0).all())
@@ -126,35 +143,23 @@ def test_feet_that_nobody_sees_are_where_legs_let_expect_them(four, tracked):
     assert float(held[1]) > 0.8
 
 
-def test_a_foot_that_is_hidden_for_long_has_its_prior_again(four):
-    shown, _, keypoints = four
-    hidden, blind = keypoints.clone(), keypoints.clone()
-    hidden[2:, :, 15:] = torch.nan
-    blind[:, :, 15:] = torch.nan
-    tracker = BodyTracker(shown.rig, "kalman", fps=FPS)
-    known, never = (tracker(keypoints=k, names=WITH_FEET).feet for k in (hidden, blind))
+def test_a_foot_that_is_hidden_for_long_has_its_prior_again(spoiled):
+    known, never = (spoiled[name].feet for name in ("hidden", "blind"))
     wide = never.points_std()[-1]
     assert bool((known.points_std()[-1] > 0.6 * wide).all())
     assert bool((known.points_std()[1] < 0.45 * wide).all())
 
 
-def test_wild_toes_move_nothing(four, tracked):
-    shown, feet, keypoints = four
-    wild = keypoints.clone()
-    wild[10:20, 1, 15:] += 150.0
-    found = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=wild, names=WITH_FEET)
+def test_wild_toes_move_nothing(four, tracked, spoiled):
+    _, feet, _ = four
+    found = spoiled["wild"]
     assert float(found.feet.inlier[10:20, 1].mean()) < 0.05
     assert float(errors(found, feet)[10:20].mean()) < float(errors(tracked, feet).mean()) + 5
 
 
-def test_feet_of_a_camera_that_exchanges_legs_are_undone(four, tracked):
-    shown, feet, keypoints = four
-    turned = keypoints.clone()
-    legs = [i for i, n in enumerate(WITH_FEET) if n.split("_")[-1] in ("hip", "knee", "ankle")]
-    moved = legs + list(range(15, 21))
-    other = [WITH_FEET.index(_other(WITH_FEET[i])) for i in moved]
-    turned[8:20, 2][:, moved] = keypoints[8:20, 2][:, other]
-    found = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=turned, names=WITH_FEET)
+def test_feet_of_a_camera_that_exchanges_legs_are_undone(four, tracked, spoiled):
+    _, feet, _ = four
+    found = spoiled["turned"]
     assert float(errors(found, feet)[8:20].mean()) < float(errors(tracked, feet).mean()) + 5
     assert float(found.feet.inlier[9:20, 2].mean()) > 0.8
 
@@ -164,11 +169,8 @@ def _other(name):
     return f"{'right' if side == 'left' else 'left'}_{kind}"
 
 
-def test_a_camera_without_the_body_tells_nothing_of_feet(four):
-    shown, _, keypoints = four
-    elsewhere = keypoints.clone()
-    elsewhere[:, 3, :15] = torch.nan
-    found = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=elsewhere, names=WITH_FEET)
+def test_a_camera_without_the_body_tells_nothing_of_feet(spoiled):
+    found = spoiled["elsewhere"]
     assert bool((found.feet.inlier[:, 3] == 0).all())
     assert float(found.feet.inlier[:, :3].mean()) > 0.9
 

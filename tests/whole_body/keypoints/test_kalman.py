@@ -51,15 +51,6 @@ def filtered(four):
     return track(four)
 
 
-def beginning(given, frames):
-    """The first frames of a scene."""
-    return given._replace(
-        joints=given.joints[:frames],
-        keypoints=given.keypoints[:frames],
-        confidence=given.confidence[:frames],
-    )
-
-
 # --- accuracy ---------------------------------------------------------------------------------------
 
 
@@ -150,58 +141,99 @@ def test_a_motion_is_taken_by_its_name_or_as_it_is(four, filtered):
 # --- faults -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("away", [100.0, 1e4, 1e6])
-def test_one_wild_keypoint_moves_nothing(four, filtered, away):
-    given = beginning(four, 16)
-    keypoints = given.keypoints.clone()
+AWAY = (100.0, 1e4, 1e6)  # pixels
+
+
+@pytest.fixture(scope="module")
+def spoiled(four):
+    """What was there, and the track, of the scene with each fault: all are tracked in one batch."""
+    cases = {
+        "none": (four.joints, four.keypoints),
+        "somebody else": (four.joints, scene(4, T, seed=5).keypoints),
+        **{f"wild by {away:g}": (four.joints, _with_wild_wrist(four, away)) for away in AWAY},
+        "exchanged": (four.joints, _with_exchanged_legs(four)),
+        "unseen": (four.joints, _without_wrist(four)),
+        "jump": _with_jumping_wrist(four),
+        "elsewhere": _who_is_elsewhere(four),
+    }
+    keypoints = torch.stack([seen for _, seen in cases.values()])
+    confidence = four.confidence.expand(len(cases), -1, -1, -1)
+    tracks = tracker(four.rig)(keypoints=keypoints, confidence=confidence)
+    return {
+        name: (joints, found)
+        for (name, (joints, _)), found in zip(cases.items(), tracks, strict=True)
+    }
+
+
+def _with_wild_wrist(four, away):
+    keypoints = four.keypoints.clone()
     keypoints[12, 1, J("left_wrist")] += away
-    found = track(given._replace(keypoints=keypoints))
-    moved = (found.joints3d - filtered.joints3d[:16]).norm(dim=-1)
-    assert float(moved[12].max()) < 0.04 and float(moved[15].max()) < 0.02
-    assert float(found.details["inlier"][12, 1, J("left_wrist")]) < 0.01
+    return keypoints
 
 
-def test_exchanged_sides_of_a_camera_are_told_and_undone(four):
-    given = beginning(four, 22)
-    keypoints = given.keypoints.clone()
+def _with_exchanged_legs(four):
+    keypoints = four.keypoints.clone()
     legs = [
         J(f"{side}_{joint}") for side in ("left", "right") for joint in ("hip", "knee", "ankle")
     ]
     mirrored = [*legs[3:], *legs[:3]]
-    keypoints[15:20, 2, legs] = given.keypoints[15:20, 2, mirrored]
-    found = track(given._replace(keypoints=keypoints))
+    keypoints[15:20, 2, legs] = four.keypoints[15:20, 2, mirrored]
+    return keypoints
+
+
+def _without_wrist(four):
+    keypoints = four.keypoints.clone()
+    keypoints[20:28, :, J("right_wrist")] = torch.nan
+    return keypoints
+
+
+def _with_jumping_wrist(four):
+    joints = moving_body(T)
+    joints[20:, J("left_wrist")] = joints[20:, J("left_elbow")] + (
+        joints[20:, J("left_elbow")] - joints[20:, J("left_wrist")]
+    )
+    return joints, four.rig(joints).pixels
+
+
+def _who_is_elsewhere(four):
+    joints = four.joints.clone()
+    joints[25:] += torch.tensor([0.9, 0.0, -0.6])
+    keypoints = four.rig(joints).pixels
+    keypoints[15:25] = torch.nan
+    return joints, keypoints
+
+
+@pytest.mark.parametrize("away", AWAY)
+def test_one_wild_keypoint_moves_nothing(spoiled, filtered, away):
+    _, found = spoiled[f"wild by {away:g}"]
+    moved = (found.joints3d - filtered.joints3d).norm(dim=-1)
+    assert float(moved[12].max()) < 0.04 and float(moved[15].max()) < 0.02
+    assert float(found.details["inlier"][12, 1, J("left_wrist")]) < 0.01
+
+
+def test_exchanged_sides_of_a_camera_are_told_and_undone(spoiled):
+    joints, found = spoiled["exchanged"]
     assert (found.details["exchanged"][15:20, 2, 1] > 0.9).all()
     assert (found.details["exchanged"][15:20, 2, 0] < 0.1).all()
     assert (found.details["exchanged"][:15, 2] < 0.1).all()
-    assert float(errors(found, given.joints)[15:20].mean()) < 0.012
+    assert float(errors(found, joints)[15:20].mean()) < 0.012
 
 
-def test_a_joint_that_no_camera_sees_goes_on_and_comes_back(four):
-    keypoints = four.keypoints.clone()
-    keypoints[20:28, :, J("right_wrist")] = torch.nan
-    found = track(four._replace(keypoints=keypoints))
-    wrong = errors(found, four.joints)[:, J("right_wrist")]
+def test_a_joint_that_no_camera_sees_goes_on_and_comes_back(spoiled):
+    joints, found = spoiled["unseen"]
+    wrong = errors(found, joints)[:, J("right_wrist")]
     assert float(wrong[20:28].max()) < 0.25 and float(wrong[31:].max()) < 0.03
     std = found.covariance3d[:, J("right_wrist")].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     assert float(std[27]) > 2 * float(std[19])
 
 
-def test_a_limb_that_jumps_is_found_again(four):
-    joints = moving_body(T)
-    joints[20:, J("left_wrist")] = joints[20:, J("left_elbow")] + (
-        joints[20:, J("left_elbow")] - joints[20:, J("left_wrist")]
-    )
-    keypoints = four.rig(joints).pixels
-    found = track(four._replace(keypoints=keypoints))
+def test_a_limb_that_jumps_is_found_again(spoiled):
+    joints, found = spoiled["jump"]
     assert float(errors(found, joints)[26:, J("left_wrist")].max()) < 0.05
 
 
-def test_a_person_who_went_away_is_found_elsewhere(four):
-    joints = four.joints.clone()
-    joints[25:] += torch.tensor([0.9, 0.0, -0.6])
-    keypoints = four.rig(joints).pixels
-    keypoints[15:25] = torch.nan
-    found = track(four._replace(keypoints=keypoints))
+def test_a_person_who_went_away_is_found_elsewhere(spoiled):
+    joints, found = spoiled["elsewhere"]
     assert found.coasting[15:25].all() and not found.coasting[25:].any()
     assert float(errors(found, joints)[-1].mean()) < 0.03
 
@@ -436,19 +468,18 @@ def test_a_camera_whose_video_stands_still_is_named():
 def test_frame_by_frame_gives_the_same(four, filtered):
     live = tracker(four.rig)
     state, poses = live.init(), []
-    for keypoints, confidence in zip(four.keypoints, four.confidence, strict=True):
+    for keypoints, confidence in zip(four.keypoints[:20], four.confidence[:20], strict=True):
         state, pose = live.step(state, keypoints=keypoints, confidence=confidence)
         poses.append(pose.joints3d[0])
-    torch.testing.assert_close(torch.stack(poses), filtered.joints3d, rtol=0, atol=1e-12)
+    torch.testing.assert_close(torch.stack(poses), filtered.joints3d[:20], rtol=0, atol=1e-12)
 
 
-def test_a_batch_gives_each_its_own(four, filtered):
-    other = scene(4, T, seed=5)
-    both = tracker(four.rig)(
-        keypoints=torch.stack([other.keypoints, four.keypoints]),
-        confidence=torch.stack([other.confidence, four.confidence]),
-    )
-    torch.testing.assert_close(both[1].joints3d, filtered.joints3d, rtol=0, atol=1e-9)
+def test_a_batch_gives_each_its_own(spoiled, filtered):
+    for name in ("joints3d", "covariance3d"):
+        own = getattr(spoiled["none"][1], name)
+        torch.testing.assert_close(own, getattr(filtered, name), rtol=0, atol=1e-9)
+    other = spoiled["somebody else"][1].joints3d
+    assert not torch.allclose(other, filtered.joints3d, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("smoothing", ["none", "full"])
@@ -468,18 +499,19 @@ def test_a_batch_of_different_lengths_gives_each_its_own(n_cameras, smoothing):
     tracks = follow(
         keypoints=keypoints, confidence=confidence, smoothing=smoothing, lengths=lengths
     )
-    for track, points, trust, n in zip(
-        tracks, keypoints, confidence, lengths.tolist(), strict=True
-    ):
-        alone = follow(keypoints=points[:n], confidence=trust[:n], smoothing=smoothing)
-        cut = follow(
-            keypoints=points, confidence=trust, smoothing=smoothing, lengths=torch.tensor([n])
-        )
+    alone = [
+        follow(keypoints=points[:n], confidence=trust[:n], smoothing=smoothing)
+        for points, trust, n in zip(keypoints, confidence, lengths.tolist(), strict=True)
+    ]
+    cut = follow(
+        keypoints=keypoints[0], confidence=confidence[0], smoothing=smoothing, lengths=lengths[:1]
+    )
+    for track, own, near in (*zip(tracks, alone, 3 * [close], strict=True), (cut, alone[0], 1e-9)):
+        n = len(own)
         for name in ("joints3d", "covariance3d", "state", "coasting"):
-            own = getattr(alone, name)
-            torch.testing.assert_close(getattr(track, name)[:n], own, rtol=0, atol=close)
-            torch.testing.assert_close(getattr(cut, name)[:n], own, rtol=0, atol=1e-9)
-        assert track.notes == cut.notes == alone.notes and len(track) == len(cut) == 12
+            expected = getattr(own, name)
+            torch.testing.assert_close(getattr(track, name)[:n], expected, rtol=0, atol=near)
+        assert track.notes == own.notes and len(track) == 12
         assert (track.joints3d[n:] == track.joints3d[n - 1]).all()
         assert not track.log_evidence[n:].any()
 

@@ -46,7 +46,7 @@ def test_persons_who_pass_each_other_stay_who_they_are(cameras):
     mixed, order = shuffled(pixels)
     found = tracker(rig)(keypoints=mixed, persons="all")
     assert [len(one) for one in found] == [T, T]
-    alone = [tracker(rig)(keypoints=pixels[:, :, p]) for p in range(2)]
+    alone = tracker(rig)(keypoints=pixels.movedim(2, 0))
     for one in found:
         p = int((one.joints3d - joints.movedim(1, 0)).norm(dim=-1).mean((1, 2)).argmin())
         error = (one.joints3d - joints[:, p]).norm(dim=-1).mean()
