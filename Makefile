@@ -9,8 +9,10 @@ export OMP_NUM_THREADS ?= 1
 export NO_MKDOCS_2_WARNING := 1
 TEST_PROCESSES ?= 2
 # The tests of a file stay in one process, which makes what they share once. Files keep their order, in
-# which those with few and long tests are not the last, when one process would wait for the other.
-PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
+# which those with few and long tests are not the last, when one process would wait for the other. glibc
+# keeps what tensors leave free: half of the time of the system went into giving it back and having it anew.
+PYTEST := MALLOC_TRIM_THRESHOLD_=268435456 MALLOC_MMAP_THRESHOLD_=33554432 \
+          $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 # The suite starts many processes: they share compiled modules.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -72,7 +74,8 @@ install: $(VENV)/.installed-dev
 # of its process, and the next one starts with a new environment. pip would compile one module after the
 # other, in one process; a few modules of other libraries are for other versions of Python. Of the
 # unused ones hardly any is ever imported; Python compiles these then.
-UNUSED := tests?|_inductor|fontTools|kornia|mypyc?|networkx|onnxruntime|pip|pygments|setuptools
+UNUSED := tests?|_inductor|_vendor|aiohttp|fontTools|grpc|kornia|lightning_fabric|mypyc?|networkx
+UNUSED := $(UNUSED)|onnxruntime|pip|pygments|pytorch_lightning|setuptools|tensorboard|testing|torchgen
 $(VENV)/.installed-%: pyproject.toml constraints.txt
 	@set -e; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
