@@ -130,8 +130,8 @@ def batch_rows(clip: Any, frames: int, batches: Sequence[int], runs: int) -> Any
 def floor_flops() -> float:
     """Return the operations of the products of one frame."""
     predict = 2 * 2 * _N**3
-    each = 2 * _ROWS * _N * _N + 2 * 2 * _ROWS * _ROWS * _N + _ROWS**3 / 3 + _ROWS**2 * _N
-    return predict + _ITERATIONS * each + 2 * _ROWS * _N * _N
+    each = 2 * _ROWS * _N * _N + 2 * _ROWS * _ROWS * _N + _ROWS**3 / 3 + _ROWS**3
+    return predict + _ITERATIONS * each + _ROWS**2 * _N + 2 * _ROWS * _N * _N
 
 
 if __name__ == "__main__":

@@ -306,10 +306,10 @@ class BodyKalmanFilter(nn.Module):
             step = self._step(readings, found, d)
             d = step.step
             point = self.articulation.moved(state.mean, d)
-            UH = step.U @ found.H.mT
-            joint_cov, G, found = point_blocks(found.G - UH.mT @ UH), found.G, None
+            joint_cov = point_blocks(found.G) - step.explained_points(found.G)
+            last, found = found, None
         assert joint_cov is not None  # there is a step at least
-        return self._corrected(state, readings, point, joint_cov, step, G)
+        return self._corrected(state, readings, point, joint_cov, step, last)
 
     def _linearised(
         self,
@@ -346,14 +346,15 @@ class BodyKalmanFilter(nn.Module):
         point: BodyPoint,
         joint_cov: Tensor,
         step: InformationStep,
-        G: Tensor,
+        last: _Linearised,
     ) -> CorrectedBody:
         a = self.articulation
-        cov = state.cov - step.U.mT @ step.U
+        U = step.explained(last.HP)
+        cov = state.cov - U.mT @ U
         joints = a.joints(point)
         seen = see(self.maps, joints)
         weighed = weigh(readings, seen, self.maps, state.beliefs, self.exchange)
-        off = (step.pulled * (G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
+        off = (step.pulled * (last.G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
         fit = -0.5 * off - step.chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         scale, told = self._next_scale(state, readings, seen, weighed, joint_cov)
         after = BodyGaussian(

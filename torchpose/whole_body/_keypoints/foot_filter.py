@@ -162,19 +162,22 @@ class FootFilter(nn.Module):
         points, H = self.linearise(state.mean, legs)
         HP = H @ state.cov
         G = HP @ H.mT
+        covs = point_blocks(G)
         inlier = torch.zeros_like(frame.inlier)
         if bool((frame.inlier > 0).any()):
             exchange = Exchange(self._mirror, self._legs)
             readings, seen = readings_of(frame, exchange), see(maps, points.flatten(1, 2))
-            spread = point_blocks(G).flatten(1, 2)
-            weighed = weigh(readings, seen, maps, beliefs, exchange, spread, marginal=True)
+            weighed = weigh(
+                readings, seen, maps, beliefs, exchange, covs.flatten(1, 2), marginal=True
+            )
             W, b = (value.unflatten(1, (2, 3)) for value in information(readings, seen, weighed))
             step = information_step(H, HP, G, W, b, torch.zeros_like(state.mean))
-            UH, cov = step.U @ H.mT, state.cov - step.U.mT @ step.U
+            U = step.explained(HP)
+            cov = state.cov - U.mT @ U
             state = state._replace(mean=state.mean + step.step, cov=(cov + cov.mT) / 2)
             points = points + (H @ step.step[..., None]).unflatten(-2, (3, 3)).squeeze(-1)
-            G, inlier = G - UH.mT @ UH, weighed.inlier
-        return state, self._poses(state, legs, points, point_blocks(G), inlier)
+            covs, inlier = covs - step.explained_points(G), weighed.inlier
+        return state, self._poses(state, legs, points, covs, inlier)
 
     def predict(
         self, before: FootGaussian | None, legs: Legs, fresh: Bool[Tensor, " B"]

@@ -13,12 +13,30 @@ _LEAST_INFORMATION = 1e-9  # per square metre, of joints that no camera measures
 
 
 class InformationStep(NamedTuple):
-    """Holds a step of an iteration: d [..., N], y' [..., K], Cholesky factor, U with P' = P - U^T U."""
+    """Holds a step of an iteration.
+
+    step: d [..., N]. pulled: y' [..., K]. chol: Cholesky factor C of 1 + L^T G L [..., K, K].
+    factors: L [..., J, 3, 3], with L L^T = W.
+    """
 
     step: Tensor
     pulled: Tensor
     chol: Tensor
-    U: Tensor
+    factors: Tensor
+
+    def explained(self, moments: Float[Tensor, "*batch K M"]) -> Float[Tensor, "*batch K M"]:
+        """Return C^-1 L^T M for covariances M of the points with something; its square is what becomes known.
+
+        By U of M = H P the covariance after the step is P - U^T U.
+        """
+        return torch.linalg.solve_triangular(
+            self.chol, _by_blocks(self.factors, moments), upper=False
+        )
+
+    def explained_points(self, G: Float[Tensor, "*batch K K"]) -> Float[Tensor, "*batch J 3 3"]:
+        """Return how much smaller the covariance of each point becomes, of covariances G = H P H^T."""
+        U = self.explained(G).unflatten(-1, (-1, 3)).movedim(-3, -1)
+        return U @ U.mT
 
 
 def information_step(
@@ -36,16 +54,19 @@ def information_step(
         W, b: information about the points, and the pull on them. d: from the prediction to where H is.
     """
     L = _factors(W)
-    LHP = (L.mT @ HP.unflatten(-2, (-1, 3))).flatten(-3, -2)
-    LGL = ((LHP @ H.mT).unflatten(-1, (-1, 3)).transpose(-3, -2) @ L).transpose(-3, -2)
-    chol = torch.linalg.cholesky(plus_one(LGL.flatten(-2)))
-    U = torch.linalg.solve_triangular(chol, LHP, upper=False)
+    chol = torch.linalg.cholesky(plus_one(_by_blocks(L, _by_blocks(L, G).mT)))
     moved = (H @ d[..., None]).unflatten(-2, (-1, 3))
     y = (b[..., None] + W @ moved).flatten(-3, -2)
-    Gy = (G @ y).unflatten(-2, (-1, 3))
-    solved = torch.cholesky_solve((L.mT @ Gy).flatten(-3, -2), chol)
+    solved = torch.cholesky_solve(_by_blocks(L, G @ y), chol)
     pulled = y - (L @ solved.unflatten(-2, (-1, 3))).flatten(-3, -2)
-    return InformationStep((HP.mT @ pulled).squeeze(-1), pulled.squeeze(-1), chol, U)
+    return InformationStep((HP.mT @ pulled).squeeze(-1), pulled.squeeze(-1), chol, L)
+
+
+def _by_blocks(
+    L: Float[Tensor, "*batch J 3 3"], rows: Float[Tensor, "*batch K M"]
+) -> Float[Tensor, "*batch K M"]:
+    """Return L^T M with a block for the three rows of each point."""
+    return (L.mT @ rows.unflatten(-2, (-1, 3))).flatten(-3, -2)
 
 
 def plus_one(matrix: Tensor) -> Tensor:
