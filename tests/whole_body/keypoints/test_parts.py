@@ -11,7 +11,7 @@ from torchpose.body import BODY_15
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
-from torchpose.whole_body._keypoints.body_transition import transition
+from torchpose.whole_body._keypoints.body_transition import coasting_transition, transition
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Beliefs,
@@ -145,11 +145,32 @@ def test_keypoints_of_joints_behind_a_camera_are_outliers():
     assert weighed.log_evidence < off.log_evidence + 1e-6
 
 
-def test_a_prediction_in_two_halves_is_one(motion):
-    whole, half = transition(motion, 0.04), transition(motion, 0.02)
+@pytest.mark.parametrize("coasting", [False, True])
+def test_a_prediction_in_two_halves_is_one(motion, coasting):
+    up = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
+    whole, half = (
+        coasting_transition(motion, dt, up) if coasting else transition(motion, dt)
+        for dt in (0.04, 0.02)
+    )
     torch.testing.assert_close(half.matrix @ half.matrix, whole.matrix, rtol=1e-10, atol=1e-12)
     noise = half.matrix @ half.noise @ half.matrix.mT + half.noise
     torch.testing.assert_close(noise, whole.noise, rtol=1e-8, atol=1e-14)
+
+
+def test_only_the_horizontal_motion_of_whom_nobody_sees_goes_on(motion):
+    body = motion.articulation
+    point = random_point(body)._replace(velocity=torch.ones(2, body.n_pose).double())
+    filter = BodyKalmanFilter(motion, ring(2), 30.0, up="y")
+    usual = filter.transition.step(body, point)
+    seen, unseen = filter.transition_of(torch.tensor([False, True])).step(body, point)
+    torch.testing.assert_close(seen, usual[0])
+    x, y, z = unseen[body.columns["position"]]
+    assert float(x) == pytest.approx(1 / 30, rel=0.01) and float(z) == pytest.approx(float(x))
+    assert float(x) > 1.05 * float(y)
+    rest = torch.ones(body.dim, dtype=torch.bool)
+    rest[body.columns["position"]] = rest[body.columns["velocity"]] = False
+    torch.testing.assert_close(unseen[rest], usual[1, rest])
+    assert float(y) == pytest.approx(float(usual[1, 1]))
 
 
 def test_a_height_tells_the_legs(motion):

@@ -185,6 +185,54 @@ def test_who_enters_late_and_leaves_is_tracked_while_there():
     assert (found[1].details["detection"][:, 2] == -1).all()
 
 
+SLOW = 15  # frames a second
+
+
+def walkers(starts, cameras=2, seconds=1.7, speed=1.2, seed=0):
+    """Persons who walk along x from starts [x, z] beside each other: rig, keypoints [T, C, P, 15, 2]."""
+    bodies = [moving_body(round(seconds * FPS), 1.8 - 0.1 * i)[::2] for i in range(len(starts))]
+    time = torch.arange(len(bodies[0]), dtype=torch.float64) / SLOW
+    joints = torch.stack(bodies, 1)
+    for i, (x, z) in enumerate(starts):
+        joints[:, i, :, 0] += x + speed * time[:, None]
+        joints[:, i, :, 2] += z
+    rig = ring(cameras)
+    generator = torch.Generator().manual_seed(seed)
+    pixels = torch.stack([rig(joints[:, p]).pixels for p in range(len(starts))], 2)
+    return rig, pixels + 3 * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+
+
+def followed(rig, pixels):
+    found = BodyTracker(rig, method="kalman", fps=SLOW)(keypoints=pixels, persons="all")
+    return sorted((one.first_frame, len(one)) for one in found)
+
+
+@pytest.mark.parametrize(("cameras", "seconds"), [(2, 0.5), (2, 0.9), (1, 0.5)])
+def test_who_walks_on_unseen_is_the_same_person(cameras, seconds):
+    rig, pixels = walkers([(-1.0, 0.0), (-1.0, 1.0)], cameras)
+    pixels[8 : 8 + round(seconds * SLOW), :, 0] = math.nan
+    assert followed(rig, pixels) == [(0, len(pixels))] * 2
+
+
+def test_who_enters_elsewhere_is_not_who_left_before():
+    rig, pixels = walkers([(-1.0, 0.0), (-1.0, 1.0), (-1.0, -1.3)])
+    pixels[8:, :, 0] = pixels[:16, :, 2] = math.nan  # half a second with neither
+    assert followed(rig, pixels) == [(0, 8), (0, len(pixels)), (16, len(pixels) - 16)]
+
+
+def test_two_who_come_back_together_are_who_they_were():
+    rig, pixels = walkers([(-1.0, 0.0), (-1.0, 0.6)])
+    pixels[8:18] = math.nan
+    tracker = BodyTracker(rig, method="kalman", fps=SLOW)
+    found = tracker(keypoints=shuffled(pixels)[0], persons="all")
+    assert len(found) == 2
+    seen = torch.stack([rig(one.joints3d).pixels[-1] for one in found])
+    off = (seen[:, None] - pixels[-1].transpose(0, 1)).norm(dim=-1).mean((-1, -2))
+    first = torch.stack([rig(one.joints3d).pixels[0] for one in found])
+    before = (first[:, None] - pixels[0].transpose(0, 1)).norm(dim=-1).mean((-1, -2))
+    assert off.argmin(1).tolist() == before.argmin(1).tolist()
+
+
 def back_to_back(turn):
     """Two persons 0.6 m apart, seen from a turned side by three cameras: joints and keypoints."""
     joints = [moving_body(T) @ about_up(turn), moving_body(T, 1.8, phase=0.4) @ about_up(turn + 3)]

@@ -1,8 +1,9 @@
 """Filter the state of an articulated body from keypoints by an iterated extended Kalman filter.
 
-Prediction: position and angles go on with velocities that decay (an Ornstein-Uhlenbeck process), bone scales
-are nearly constant, shifts of joints decay to zero (`body_transition`). A pose prior pulls angles with the
-share dt / T of its information, so that alone it would decide about them within its time T.
+Prediction: position and angles go on with velocities that decay (an Ornstein-Uhlenbeck process), but hardly
+across the room while nothing is measured. Bone scales are nearly constant, shifts of joints decay to zero
+(`body_transition`). A pose prior pulls angles with the share dt / T of its information, so that alone it
+would decide about them within its time T.
 
 Correction, iterated at x_i with d = x_i - x_predicted in the tangent space:
 
@@ -30,6 +31,7 @@ from torchpose.math._gaussian import point_blocks
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_transition import (
     BodyTransition,
+    coasting_transition,
     jump_variance,
     transition,
 )
@@ -168,11 +170,35 @@ class BodyKalmanFilter(nn.Module):
     @property
     def transition(self) -> BodyTransition:
         """Return the model of one frame."""
+        motion, dt = self.motion, 1 / self.fps
+        return derived(self, "transition", self._moving, lambda: transition(motion, dt))
+
+    def transition_of(self, coasting: Bool[Tensor, "*batch"]) -> BodyTransition:
+        """Return the model of one frame of each body, by whether nothing was measured in the one before."""
+        if not bool(coasting.any()):
+            return self.transition
+        motion, dt = self.motion, 1 / self.fps
+        sources = (*self._moving, self._rig[0].rotation)
+        unseen = derived(
+            self, "coasting", sources, lambda: coasting_transition(motion, dt, self._up.direction)
+        )
+        return self.transition.where_coasting(unseen, coasting)
+
+    @property
+    def _moving(self) -> tuple[Tensor, ...]:
+        """Return what the model of one frame is made of."""
         motion = self.motion
-        sources = (
+        return (
             motion.acceleration, motion.decay, motion.shift_std, motion.shift_time, motion.pull_time,
         )  # fmt: skip
-        return derived(self, "transition", sources, lambda: transition(motion, 1 / self.fps))
+
+    @property
+    def _up(self) -> Upright:
+        """Return how people lean, by the cameras where it is not known which way is up."""
+        if self.upright is not None:
+            return self.upright
+        rig = self._rig[0]
+        return derived(self, "level", (rig.rotation,), lambda: level_cameras_up(rig))
 
     @property
     def _jump_variance(self) -> Float[Tensor, " N"]:
@@ -180,9 +206,15 @@ class BodyKalmanFilter(nn.Module):
         motion = self.motion
         return derived(self, "jump", (motion.acceleration,), lambda: jump_variance(motion))
 
-    def predict(self, state: BodyGaussian) -> BodyGaussian:
-        """Return the Gaussian one frame later."""
-        model = self.transition
+    def predict(
+        self, state: BodyGaussian, coasting: Bool[Tensor, " B"] | None = None
+    ) -> BodyGaussian:
+        """Return the Gaussian one frame later.
+
+        Args:
+            state: of a frame. coasting: of whom nothing was measured in it; of nobody if None.
+        """
+        model = self.transition if coasting is None else self.transition_of(coasting)
         mean = self.articulation.moved(state.mean, model.step(self.articulation, state.mean))
         cov = model.matrix @ state.cov @ model.matrix.mT + model.noise
         log_odds, doubt = model.next_log_odds(state.log_odds), model.next_doubt(state.doubt)
@@ -252,9 +284,7 @@ class BodyKalmanFilter(nn.Module):
         """Return Gaussians after a share of the information about leans where cameras are about level."""
         if self.upright is not None:  # `predict` has done so
             return state
-        rig = self._rig[0]
-        up = derived(self, "level", (rig.rotation,), lambda: level_cameras_up(rig))
-        return self._erected(state, up, self.transition.share)
+        return self._erected(state, self._up, self.transition.share)
 
     def _corrected_as_predicted(
         self, state: BodyGaussian, frame: KeypointFrame, readings: KeypointFrame

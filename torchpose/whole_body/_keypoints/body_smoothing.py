@@ -25,6 +25,7 @@ def smooth(
     filtered: BodyMoments,
     widened: Float[Tensor, "B T N"],
     started: Bool[Tensor, "B T"],
+    coasting: Bool[Tensor, "B T"],
 ) -> Iterator[tuple[slice, BodyMoments]]:
     """Yield which frames were smoothed, and their states, for parts of sequences from the last frame on.
 
@@ -37,6 +38,7 @@ def smooth(
     Args:
         filter: that filtered. filtered: posteriors of T frames. widened: variances added to the predictions.
         started: frames in which tracking began anew, which say nothing of the frames before.
+        coasting: frames in which nothing was measured.
     """
     last = filtered.cov.shape[1] - 1
     after: BodyMoments = mapped(lambda value: value[:, last].clone(), filtered)
@@ -45,8 +47,9 @@ def smooth(
         rows = slice(max(0, end - PART), end)
         later = slice(rows.start + 1, end + 1)
         part = _smoothed(
-            filter, part_of(filtered, rows), after, widened[:, later], started[:, later]
-        )
+            filter, part_of(filtered, rows), after, widened[:, later], started[:, later],
+            coasting[:, rows],
+        )  # fmt: skip
         yield rows, part
         after = mapped(lambda value: value[:, 0].clone(), part)
 
@@ -57,15 +60,16 @@ def _smoothed(
     after: BodyMoments,
     widened: Float[Tensor, "B T N"],
     started: Bool[Tensor, "B T"],
+    coasting: Bool[Tensor, "B T"],
 ) -> BodyMoments:
     """Return the smoothed states of some frames.
 
     Args:
         filter: that filtered. filtered: posteriors. after: [B], smoothed, of the frame after the last one.
-        widened, started: of the frames after each of these.
+        widened, started: of the frames after each of these. coasting: of these.
     """
     body, found = filter.articulation, [after]
-    ahead, predicted, gains = _gains(filter, filtered, widened, started)
+    ahead, predicted, gains = _gains(filter, filtered, widened, started, coasting)
     for t in range(predicted.shape[1] - 1, -1, -1):
         (mean, cov), expected = frame_at((filtered, ahead), t)
         off = body.difference(found[-1].mean, expected)
@@ -81,13 +85,15 @@ def _gains(
     filtered: BodyMoments,
     widened: Float[Tensor, "B T N"],
     started: Bool[Tensor, "B T"],
+    coasting: Bool[Tensor, "B T"],
 ) -> tuple[BodyPoint, Tensor, Tensor]:
     """Return means and covariances predicted for the frames after some, and C.
 
     Args:
         filter: that filtered. filtered: posteriors. widened, started: of the frames after these.
+            coasting: of these.
     """
-    model, body = filter.transition, filter.articulation
+    model, body = filter.transition_of(coasting), filter.articulation
     ahead = body.moved(filtered.mean, model.step(body, filtered.mean))
     carried = model.matrix @ filtered.cov
     predicted = carried @ model.matrix.mT + model.noise + torch.diag_embed(widened)

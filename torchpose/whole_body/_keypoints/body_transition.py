@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -18,13 +18,15 @@ _STAYS_LOST = 0.6  # share of such joints that a frame does not find again
 _ODDS = 1e-6  # least probability
 _JUMPS = {"position": 0.1, "rotations": 0.7, "velocity": 5.0, "shifts": 0.05}
 _ROOT_JUMP = 1.0  # metres per second
+_KEPT = 0.1  # 1/s, decay of the root's horizontal velocity while nothing is measured
 
 
 class BodyTransition(NamedTuple):
     """Holds the model of one frame.
 
     Attributes:
-        matrix, noise: [N, N], of the tangent. share: of the pose prior's information that a frame adds.
+        matrix, noise: [N, N], or of each body [*batch, N, N], of the tangent.
+        share: of the pose prior's information that a frame adds.
         begin, end: probabilities that an exchange of sides begins, and ends. lost: that a joint is.
     """
 
@@ -41,7 +43,15 @@ class BodyTransition(NamedTuple):
         moving = point.velocity.new_zeros(*point.velocity.shape[:-1], articulation.dim)
         moving[..., at["velocity"]] = point.velocity
         moving[..., at["shifts"]] = point.shifts.flatten(-2)
-        return moving @ self.matrix.mT - moving
+        return (moving.unsqueeze(-2) @ self.matrix.mT).squeeze(-2) - moving
+
+    def where_coasting(
+        self, other: "BodyTransition", coasting: Bool[Tensor, "*batch"]
+    ) -> "BodyTransition":
+        """Return the model of each body, another one for those of whom nothing was measured."""
+        rows = coasting[..., None, None]
+        matrix = torch.where(rows, other.matrix, self.matrix)
+        return self._replace(matrix=matrix, noise=torch.where(rows, other.noise, self.noise))
 
     def next_log_odds(self, log_odds: Float[Tensor, "*batch C 2"]) -> Float[Tensor, "*batch C 2"]:
         """Return the log-odds of exchanged sides one frame later."""
@@ -53,23 +63,29 @@ class BodyTransition(NamedTuple):
         return torch.logit(_STAYS_LOST * doubt.sigmoid() + self.lost, _ODDS)
 
 
-def transition(motion: BodyMotion, dt: float) -> BodyTransition:
+def transition(
+    motion: BodyMotion, dt: float, decay: Float[Tensor, " V"] | None = None
+) -> BodyTransition:
     """Return the model of a frame of dt seconds.
 
     Position and angles: x' = x + b v,  v' = a v,  a = exp(-decay dt),  b = (1 - a) / decay, with the noise of
     white acceleration q,
 
         q^2 [(dt - 2 b + (1 - a^2) / (2 decay)) / decay^2,  b^2 / 2;  b^2 / 2,  (1 - a^2) / (2 decay)].
+
+    Args:
+        motion: how bodies move. dt: seconds. decay: 1/s, of other velocities than the motion's.
     """
     body = motion.articulation
+    decay = motion.decay if decay is None else decay
     at = body.columns
     matrix = torch.eye(body.dim).to(motion.acceleration)
     noise = torch.zeros_like(matrix)
     pose, velocity = torch.arange(body.n_pose), _index(at["velocity"])
-    keep = torch.exp(-motion.decay * dt)
-    matrix[pose, velocity] = (1 - keep) / motion.decay
+    keep = torch.exp(-decay * dt)
+    matrix[pose, velocity] = (1 - keep) / decay
     matrix[velocity, velocity] = keep
-    power, decay = motion.acceleration.square(), motion.decay
+    power = motion.acceleration.square()
     gone = (1 - keep) / decay
     noise[pose, pose] = power / decay.square() * (dt - 2 * gone + (1 - keep.square()) / (2 * decay))
     noise[pose, velocity] = noise[velocity, pose] = power * gone.square() / 2
@@ -83,6 +99,28 @@ def transition(motion: BodyMotion, dt: float) -> BodyTransition:
     begin, end, lost = (1 - math.exp(-rate * dt) for rate in (_EXCHANGES, _RETURNS, _LOST))
     share = dt / float(motion.pull_time)
     return BodyTransition(matrix, noise, share, begin, end, lost)
+
+
+def coasting_transition(motion: BodyMotion, dt: float, up: Float[Tensor, "3"]) -> BodyTransition:
+    """Return the model of a frame of dt seconds after one in which nothing was measured.
+
+    The decay of the root's velocity that recordings tell is of all its motion, and most of that goes to and
+    fro. By it who walks on unseen would stay behind by a metre in a second. Here the horizontal part, across
+    `up`, hardly decays.
+    """
+    at, decay = motion.articulation.columns, motion.decay.clone()
+    decay[:3] = _KEPT
+    usual, kept = transition(motion, dt), transition(motion, dt, decay)
+    root = torch.cat([_index(at["position"]), _index(at["velocity"])[:3]])
+    vertical = torch.block_diag(*[torch.outer(up, up)] * 2).to(motion.acceleration)
+
+    def mixed(usual: Float[Tensor, "N N"], kept: Float[Tensor, "N N"]) -> Float[Tensor, "N N"]:
+        block = root[:, None], root
+        kept[block] += (usual - kept)[block] @ vertical
+        return kept
+
+    matrix, noise = mixed(usual.matrix, kept.matrix), mixed(usual.noise, kept.noise)
+    return usual._replace(matrix=matrix, noise=noise)
 
 
 def jump_variance(motion: BodyMotion) -> Float[Tensor, " N"]:

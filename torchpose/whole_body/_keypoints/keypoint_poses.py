@@ -24,6 +24,7 @@ class KeypointStream(NamedTuple):
         size: of [B], of the only camera, in which the filter does not tell it.
         spread: [B, J], metres, standard deviations of the network's joints in the last frame that it lifted.
         unseen: [B, J], seconds since a keypoint was a joint's, infinite where none has been.
+        coasting: [B], of whom nothing was measured in the last frame.
     """
 
     state: BodyGaussian
@@ -35,6 +36,7 @@ class KeypointStream(NamedTuple):
     size: SizeBelief
     spread: Tensor
     unseen: Tensor
+    coasting: Tensor
 
 
 class KeypointPoses(NamedTuple):

@@ -161,6 +161,18 @@ class KeypointTracker(nn.Module):
         Returns:
             The next stream, the poses of the frame [B, ...], and what the correction gave.
         """
+        after, pose, found = self._stepped(stream, frame, predicted, waited, watch)
+        return after._replace(coasting=pose.coasting), pose, found
+
+    def _stepped(
+        self,
+        stream: KeypointStream | None,
+        frame: KeypointFrame,
+        predicted: BodyGaussian | None,
+        waited: float,
+        watch: bool,
+    ) -> KeypointStep:
+        """Return the next frame, by cameras of which some may be found to be wrong."""
         if len(self._rig[0]) == 1:
             step = self._advanced(stream, frame, predicted, waited)
             return step if self.only is None else self.only.at_size(step)
@@ -205,7 +217,7 @@ class KeypointTracker(nn.Module):
         stream = KeypointStream(
             found.state, begun, torch.zeros_like(count), torch.full_like(begun, NOBODY, dtype=torch.long),
             memory, CameraFaults.none(frame), SizeBelief.usual(self.size_std, count),
-            torch.zeros_like(never), never,
+            torch.zeros_like(never), never, torch.zeros_like(begun),
         )  # fmt: skip
         return self._with_lifted(stream, lifted, found), found, begun
 
@@ -214,7 +226,8 @@ class KeypointTracker(nn.Module):
     ) -> _Found:
         """Return what is found in the frame after that of a stream."""
         memory, lifted = self._lifted(stream, frame)
-        predicted = self.filter.predict(stream.state) if predicted is None else predicted
+        if predicted is None:
+            predicted = self.filter.predict(stream.state, stream.coasting)
         likely = predicted if lifted is None else corrected_by(lifted, self.filter, predicted)
         found = self.filter.correct(likely, frame)
         due = ~stream.begun | are_lost(stream.lost, self.filter.fps)
@@ -377,7 +390,7 @@ class KeypointTracker(nn.Module):
         """
         poses = filtered if self.only is None else self.only.as_last_told(filtered)
         states = BodyMoments(poses.point, poses.state_cov)
-        for rows, part in smooth(self.filter, states, widened, poses.started):
+        for rows, part in smooth(self.filter, states, widened, poses.started, poses.coasting):
             write_part(_told(poses), rows, _told(self._as_smoothed(part_of(poses, rows), part)))
         return poses
 

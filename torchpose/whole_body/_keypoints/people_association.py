@@ -6,7 +6,8 @@ A detection d of camera c is that of person p rather than that of somebody new b
 
 with the filter's own predictive density of keypoints. Where p's joint is behind the camera, that of somebody
 new may be anywhere in its image. In each camera the assignment of detections to persons that has the largest
-sum of log odds is taken; a person without any above 0 has none.
+sum of log odds is taken; a person without any above 0 has none. Persons who were not seen for a while get
+what others leave, and begin anew with a group of detections that is where they are expected (`returned`).
 """
 
 import math
@@ -32,6 +33,8 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 
+_TRUNK = [BODY_15.joint(name) for name in ("pelvis", "neck", "left_hip", "right_hip")]
+_REACH = 11.3  # squared standard deviations within which 99 % of places in the room are
 LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
 _BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
 _FARTHER = 2.0  # standard deviations of a prediction, within which somebody else is
@@ -125,6 +128,37 @@ def taken_detections(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> Keypoi
     cameras = torch.arange(chosen.shape[1], device=chosen.device)
     values = frame.map(lambda value: value[chosen.clamp_min(0), cameras])
     return values._replace(inlier=torch.where((chosen >= 0)[..., None], values.inlier, 0.0))
+
+
+# --- persons who come back ------------------------------------------------------------------------
+
+
+def returned(
+    filter: BodyKalmanFilter,
+    predicted: BodyGaussian,
+    away: Bool[Tensor, " P"],
+    owner: Bool[Tensor, "P G"],
+    groups: KeypointFrame,
+) -> Bool[Tensor, "P G"]:
+    """Return which groups of detections are where persons are expected who were not seen for a while.
+
+    Errors of the joints of such a prediction are nearly the same for all, so the trunk's mean error d counts
+    once: d^T C^-1 d, with the mean C of the joints' covariances. Everybody gets one group at most, and of
+    all ways to give them away the one with the least sum is taken.
+
+    Args:
+        filter: that predicted. predicted: one state for each of P persons. away: who is expected.
+        owner: whose groups are known already. groups: keypoints [G, C, J].
+    """
+    joints = triangulate(filter.maps, groups)[:, _TRUNK]
+    expected, jacobian = filter.articulation.linearise(predicted.mean)
+    cov = covariances_of(jacobian, predicted.cov)[:, _TRUNK].mean(1)
+    off = (joints - expected[:, None, _TRUNK]).nanmean(-2)
+    square = (off * torch.linalg.solve(cov, off.mT).mT).sum(-1)
+    closed = ~away[:, None] | owner.any(0) | owner.any(1, keepdim=True) | square.isnan()
+    gains = (_REACH - square).masked_fill(closed, -math.inf)
+    chosen = assign(gains[:, None])
+    return chosen == torch.arange(len(joints), device=chosen.device)
 
 
 # --- new persons ----------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from torchpose.whole_body._keypoints.people_association import (
     group_detections,
     left_over,
     owned_detections,
+    returned,
     taken_detections,
 )
 from torchpose.whole_body._keypoints.people_cameras import (
@@ -47,6 +48,7 @@ class PeopleStream(NamedTuple):
         number: [P], unlike all others before. n_begun: of numbers that were given.
         hits: [P], frames in which cameras agreed. missed: [P], frames in a row in which they did not.
         unseen: [P], frames in a row without keypoints. doubled: [P], frames in a row at another's place.
+        away: [P], who was not seen for so long since cameras agreed that somebody else may have come.
         identity: [P], from 1 on in the order in which they were confirmed, 0 of those who are tentative.
         n_confirmed: of identities that were given.
         faults: what is believed of the cameras, of one element; None before somebody was there.
@@ -59,6 +61,7 @@ class PeopleStream(NamedTuple):
     missed: Tensor
     unseen: Tensor
     doubled: Tensor
+    away: Tensor
     identity: Tensor
     n_confirmed: int
     faults: CameraFaults | None = None
@@ -106,10 +109,10 @@ class PeopleTracker:
         stream = _nobody(frame) if stream is None else stream
         detected, frame = frame, righted(self.tracker, frame, stream.faults)
         there = (frame.inlier > 0).any(-1).mT  # [C, D]
-        found, free, weak = None, there, torch.zeros_like(stream.number, dtype=torch.bool)
+        found, free, predicted = None, there, None
         if stream.bodies is not None:
-            stream, found, free, weak = self._followed(stream, frame, there)
-        stream, found = self._with_new(stream, found, frame, free, weak)
+            stream, found, free, predicted = self._followed(stream, frame, there)
+        stream, found = self._with_new(stream, found, frame, free, predicted)
         if found is None:
             return stream, None
         stream, found = self._watched(stream, found, detected)
@@ -142,20 +145,25 @@ class PeopleTracker:
 
     def _followed(
         self, stream: PeopleStream, frame: KeypointFrame, there: Bool[Tensor, "C D"]
-    ) -> tuple[PeopleStream, PeopleFrame, Bool[Tensor, "C D"], Bool[Tensor, " P"]]:
-        """Return persons one frame later, detections that begin others, and who may give theirs up."""
+    ) -> tuple[PeopleStream, PeopleFrame, Bool[Tensor, "C D"], BodyGaussian]:
+        """Return persons one frame later, detections that begin others, and where persons were expected."""
         bodies = stream.bodies
         assert bodies is not None
-        predicted = self.tracker.filter.predict(bodies.state)
+        predicted = self.tracker.filter.predict(bodies.state, bodies.coasting)
         gains = detection_gains(self.tracker.filter, predicted, frame)
-        chosen = self._chosen(gains, predicted, frame, there)
+        chosen = self._chosen(gains, predicted, frame, there, stream.away)
         keypoints = taken_detections(frame, chosen)
         after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted, watch=False)
         found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
-        weak = stream.missed > _ALONE_TIME * self.tracker.filter.fps
+        weak = self._weak(stream)
         explained = (gains > 0).masked_fill(weak[:, None, None], False).any(0)
         owned = owned_detections(chosen[~weak], there.shape[1])
-        return stream._replace(bodies=after), found, there & ~explained & ~owned, weak
+        free = there & ~explained & ~owned
+        return stream._replace(bodies=after), found, free, predicted
+
+    def _weak(self, stream: PeopleStream) -> Bool[Tensor, " P"]:
+        """Return who may give their detections up: on whom no cameras have agreed for a while."""
+        return stream.missed > _ALONE_TIME * self.tracker.filter.fps
 
     def _chosen(
         self,
@@ -163,18 +171,23 @@ class PeopleTracker:
         predicted: BodyGaussian,
         frame: KeypointFrame,
         there: Bool[Tensor, "C D"],
+        away: Bool[Tensor, " P"],
     ) -> Int[Tensor, "P C"]:
         """Return the detection of every person in every camera, -1 if none.
+
+        Whom nobody has seen for a while may be anywhere about, and would take the detection that another
+        person was missing in a camera for a moment. So they get what is left.
 
         A camera whose calibration is off sees people elsewhere. How far is learnt from their detections, so
         one that nobody wants is also theirs who are near it by a noise that is larger.
         """
-        chosen = assign(gains)
-        wanted = (gains > 0).any(0)
-        if not bool(((chosen < 0).any(0)[:, None] & there & ~wanted).any()):
-            return chosen
-        wide = detection_gains(self.tracker.filter, predicted, frame, _DOUBT)
-        return left_over(wide.masked_fill(wanted, -math.inf), chosen)
+        absent = away[:, None, None]
+        near = gains.masked_fill(absent, -math.inf)
+        chosen, wanted = assign(near), (near > 0).any(0)
+        if bool(((chosen < 0).any(0)[:, None] & there & ~wanted).any()):
+            wide = detection_gains(self.tracker.filter, predicted, frame, _DOUBT)
+            chosen = left_over(wide.masked_fill(wanted | absent, -math.inf), chosen)
+        return left_over(gains.masked_fill(~absent, -math.inf), chosen) if away.any() else chosen
 
     # --- persons who enter ------------------------------------------------------------------------
 
@@ -184,7 +197,7 @@ class PeopleTracker:
         found: PeopleFrame | None,
         frame: KeypointFrame,
         free: Bool[Tensor, "C D"],
-        weak: Bool[Tensor, " P"],
+        predicted: BodyGaussian | None,
     ) -> tuple[PeopleStream, PeopleFrame | None]:
         """Return the stream and the frame with persons who begin in it.
 
@@ -193,10 +206,34 @@ class PeopleTracker:
         whose keypoints seem to agree stay where they are.
         """
         groups = group_detections(self.tracker.filter.maps, frame, free)
-        owner = _owners(groups, found, weak)
+        owner = _owners(groups, found, self._weak(stream) & ~stream.away)
+        if predicted is not None and len(groups) and bool(stream.away.any()):
+            keypoints = taken_detections(frame, groups)
+            owner = self._with_returned(owner, stream, found, groups, keypoints, predicted)
         again = (owner & (owner.cumsum(1) > 1)).any(0)  # a second group of the same person
         chosen = (owner.sum(0) <= 1) & ~again & self._has_room(~owner.any(0), len(stream.number))
         return self._begun(stream, found, frame, groups[chosen], owner[:, chosen])
+
+    def _with_returned(
+        self,
+        owner: Bool[Tensor, "P G"],
+        stream: PeopleStream,
+        found: PeopleFrame | None,
+        groups: Int[Tensor, "G C"],
+        keypoints: KeypointFrame,
+        predicted: BodyGaussian,
+    ) -> Bool[Tensor, "P G"]:
+        """Return who begins anew with which groups, with those who had not been seen for a while.
+
+        They do with a group that is where they are expected, or that has detections of theirs: of one camera
+        if it has seen them since, else of as many as must agree.
+        """
+        if self.n_cameras > 1:
+            expected = returned(self.tracker.filter, predicted, stream.away, owner, keypoints)
+            owner = owner | expected
+        shared = _owners(groups, found, stream.away & (stream.unseen == 0))
+        shared |= _owners(groups, found, stream.away, self.agreeing)
+        return owner | (shared & ~owner.any(0) & ~owner.any(1, keepdim=True))
 
     def _begun_anew(
         self, stream: PeopleStream, found: PeopleFrame, detected: KeypointFrame
@@ -237,7 +274,7 @@ class PeopleTracker:
         zero = poses.log_evidence.new_zeros(len(groups))
         n_begun = stream.n_begun + len(groups)
         beginners = PeopleStream(
-            bodies, number, n_begun, zero, zero, zero, zero, identity, stream.n_confirmed,
+            bodies, number, n_begun, zero, zero, zero, zero, zero > 0, identity, stream.n_confirmed,
             stream.faults,
         )  # fmt: skip
         rows, keep = (flags.nonzero().squeeze(-1) for flags in (sure, ~owner[:, sure].any(-1)))
@@ -270,10 +307,12 @@ class PeopleTracker:
             (stream.identity == 0) & ~doubled & (hits >= max(_CONFIRM_FRAMES, _CONFIRM_TIME * fps))
         )
         identity = torch.where(new, stream.n_confirmed + new.cumsum(0), stream.identity)
+        unseen = torch.where(n_seen > 0, 0.0, stream.unseen + 1)
         return stream._replace(
             hits=hits,
             missed=torch.where(agreed, 0.0, stream.missed + 1),
-            unseen=torch.where(n_seen > 0, 0.0, stream.unseen + 1),
+            unseen=unseen,
+            away=~agreed & (stream.away | (unseen > _ALONE_TIME * fps)),
             doubled=torch.where(doubled, stream.doubled + 1, 0.0),
             identity=identity,
             n_confirmed=stream.n_confirmed + int(new.sum()),
@@ -302,17 +341,20 @@ class PeopleTracker:
 
 def _nobody(frame: KeypointFrame) -> PeopleStream:
     none = frame.inlier.new_zeros(0)
-    return PeopleStream(None, none.long(), 0, none, none, none, none, none.long(), 0)
+    return PeopleStream(None, none.long(), 0, none, none, none, none, none > 0, none.long(), 0)
 
 
 def _owners(
-    groups: Int[Tensor, "G C"], found: PeopleFrame | None, weak: Bool[Tensor, " P"]
+    groups: Int[Tensor, "G C"],
+    found: PeopleFrame | None,
+    weak: Bool[Tensor, " P"],
+    least: int = 1,
 ) -> Bool[Tensor, "P G"]:
-    """Return whose detections, of persons who may give theirs up, are in which groups."""
+    """Return whose detections, so many at least of persons who may give theirs up, are in which groups."""
     if found is None:
         return weak[:, None].expand(-1, len(groups))
     shared = (found.detection[:, None] == groups) & (groups >= 0)
-    return shared.any(-1) & weak[:, None]
+    return (shared.sum(-1) >= least) & weak[:, None]
 
 
 def _owned_by(
