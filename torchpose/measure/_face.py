@@ -26,7 +26,7 @@ from torchpose.measure._face_patterns import far_smaller, on_somebody
 from torchpose.measure._grey_frame import GreyFrame
 
 # About a known face: half the side of the searched region, smallest and largest face there, in its sizes.
-_CLOSE, _AROUND = (0.8, 0.8, 1.3), (1.1, 0.75, 1.4)
+_CLOSE, _AROUND = (0.85, 0.8, 1.3), (1.1, 0.75, 1.4)
 _LASTING = 10.0  # hits from which the closer search comes first
 _AS_PREDICTED = 0.15  # largest difference in place and size at which it is enough, in those sizes
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
