@@ -26,6 +26,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     late_note,
     notes_on_still_cameras,
 )
+from torchpose.whole_body._keypoints.upright import level_cameras_up
 
 J = BODY_15.joint
 T = 34
@@ -409,6 +410,48 @@ def test_hips_that_no_camera_sees_go_along_with_who_walks():
     keypoints[:, :, HIPS + legs] = math.nan
     found = tracker(given.rig)(keypoints=keypoints)
     assert float((found.joints3d - joints)[20:, HIPS].norm(dim=-1).mean()) < 0.06
+
+
+LEGS = [j for j, name in enumerate(NAMES) if name.endswith(("knee", "ankle"))]
+
+
+def at_desk(keypoints):
+    """Keypoints of the upper body alone, as of detectors that know no neck, and their names."""
+    named = [j for j, name in enumerate(NAMES) if name not in ("pelvis", "neck")]
+    hidden = keypoints.clone()
+    hidden[:, :, HIPS + LEGS] = math.nan
+    return hidden[:, :, named], [NAMES[j] for j in named]
+
+
+def test_cameras_on_one_side_that_point_down_tell_which_way_is_up():
+    rig = ring(2)
+    up = level_cameras_up(rig).direction
+    assert math.degrees(math.acos(float(up[1]))) < 1.0
+
+
+def seated(joints):
+    """The same upper bodies with thighs ahead and level, and shanks that hang."""
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=joints.dtype)
+    joints = joints.clone()
+    across = joints[:, J("left_hip")] - joints[:, J("right_hip")]
+    ahead = torch.nn.functional.normalize(torch.linalg.cross(across, up.expand_as(across)), dim=-1)
+    for side in ("left", "right"):
+        hip, knee, ankle = (joints[:, J(f"{side}_{name}")] for name in ("hip", "knee", "ankle"))
+        thigh, shank = ((a - b).norm(dim=-1, keepdim=True) for a, b in ((knee, hip), (ankle, knee)))
+        joints[:, J(f"{side}_knee")] = hip + thigh * ahead
+        joints[:, J(f"{side}_ankle")] = hip + thigh * ahead - shank * up
+    return joints
+
+
+def test_ellipsoids_hold_the_legs_of_who_sits_behind_a_desk():
+    given = scene(2, 20)
+    joints = seated(given.joints)
+    keypoints, names = at_desk(given.rig(joints).pixels)
+    found = tracker(given.rig)(keypoints=keypoints, names=names)
+    off = (found.joints3d - joints)[10:, LEGS]
+    squared = (off * torch.linalg.solve(found.covariance3d[10:, LEGS], off)).sum(-1)
+
+    assert float(squared.max()) < 11.3  # 99 % in three dimensions
 
 
 # --- cameras that disagree --------------------------------------------------------------------------

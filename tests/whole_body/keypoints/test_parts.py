@@ -7,7 +7,7 @@ import torch
 
 import torchpose
 from tests.whole_body.keypoints.scenes import ring, scene
-from torchpose.body import BODY_15
+from torchpose.body import BODY_15, Body
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
@@ -23,7 +23,12 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     weigh,
 )
-from torchpose.whole_body._keypoints.known_person import of_one_camera, with_height
+from torchpose.whole_body._keypoints.known_person import (
+    of_one_camera,
+    with_body,
+    with_height,
+    with_usual_trunk,
+)
 from torchpose.whole_body._keypoints.upright import camera_up
 
 J = BODY_15.joint
@@ -171,6 +176,27 @@ def test_only_the_horizontal_motion_of_whom_nobody_sees_goes_on(motion):
     rest[body.columns["position"]] = rest[body.columns["velocity"]] = False
     torch.testing.assert_close(unseen[rest], usual[1, rest])
     assert float(y) == pytest.approx(float(usual[1, 1]))
+
+
+def test_a_usual_trunk_is_the_prior_given_what_is_usual():
+    """By the density of the joint Gaussian of lengths and of what trunks are against arms."""
+    motion = load_body_motion("whole-body")
+    usual, groups = with_usual_trunk(motion), motion.articulation.groups
+    information = torch.linalg.inv(motion.scale_cov)
+    pull = information @ motion.scale_mean
+    for bone, other, mean, std in (("neck", "elbow", 0.05, 0.06), ("hip", "shoulder", 0.02, 0.08)):
+        h = torch.zeros_like(motion.scale_mean)
+        h[groups.index(bone)], h[groups.index(other)] = 1, -1
+        information = information + h[:, None] * h / std**2
+        pull = pull + h * mean / std**2
+    torch.testing.assert_close(usual.scale_cov, torch.linalg.inv(information))
+    torch.testing.assert_close(usual.scale_mean, torch.linalg.solve(information, pull))
+
+
+def test_a_usual_trunk_hardly_changes_a_known_person():
+    known = with_body(load_body_motion("whole-body"), Body.of_height(BODY_15, 1.7))
+    usual = with_usual_trunk(known)
+    assert float((usual.scale_mean - known.scale_mean).abs().max()) < 0.01
 
 
 def test_a_height_tells_the_legs(motion):

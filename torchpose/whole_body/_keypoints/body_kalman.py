@@ -65,6 +65,7 @@ FEW_INLIERS = 0.7
 
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which no camera sees a hip
+_HELD = 20.0  # shares of the information about leans that such a body gets
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
@@ -260,17 +261,17 @@ class BodyKalmanFilter(nn.Module):
         readings = readings_of(frame, self.exchange)
         if widths is not None:
             return self._iterated(state, readings, widths)
-        rows = self._without_hips(frame)
+        rows = self.without_hips(frame)
         if not len(rows):
             return self._corrected_as_predicted(state, frame, readings)
         carried = torch.zeros_like(state.cov[..., 0])
         carried[rows, self.articulation.columns["position"]] = _CARRIED**2 / self.fps
         state = state._replace(cov=state.cov + torch.diag_embed(carried))
-        state = replaced(state, rows, self._balanced(taken(state, rows)))
+        state = replaced(state, rows, self._held(taken(state, rows)))
         corrected = self._corrected_as_predicted(state, frame, readings)
         return corrected._replace(widened=corrected.widened + carried)
 
-    def _without_hips(self, frame: KeypointFrame) -> Int[Tensor, " N"]:
+    def without_hips(self, frame: KeypointFrame) -> Int[Tensor, " N"]:
         """Return the elements of whom none of several cameras sees a hip, but something else.
 
         Such a pelvis has to go along with the trunk. It would lag behind who walks, since its own speed is
@@ -280,11 +281,9 @@ class BodyKalmanFilter(nn.Module):
         rows = seen.any(-1) & ~seen[:, _HIPS].any(-1) & (len(self.maps.shift) > 1)
         return rows.nonzero().squeeze(-1)
 
-    def _balanced(self, state: BodyGaussian) -> BodyGaussian:
-        """Return Gaussians after a share of the information about leans where cameras are about level."""
-        if self.upright is not None:  # `predict` has done so
-            return state
-        return self._erected(state, self._up, self.transition.share)
+    def _held(self, state: BodyGaussian) -> BodyGaussian:
+        """Return Gaussians after more information about leans, without which hips that are not seen drift."""
+        return self._erected(state, self._up, _HELD * self.transition.share)
 
     def _corrected_as_predicted(
         self, state: BodyGaussian, frame: KeypointFrame, readings: KeypointFrame

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -24,6 +24,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
 )
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.known_person import with_usual_trunk
 from torchpose.whole_body._keypoints.lifted_pose import corrected_by
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.nested import replaced, taken
@@ -66,9 +67,25 @@ def start(
     joints = triangulate(filter.maps, frame)
     state = _begun(filter, joints, joints.isfinite().all(-1), n_headings)
     every = torch.arange(len(joints), device=joints.device)
-    found = filter.correct(state, frame.take(every.repeat_interleave(n_headings)), _WIDTHS)
+    frames = frame.take(every.repeat_interleave(n_headings))
+    state = _with_trunks(filter, state, filter.without_hips(frames))
+    found = filter.correct(state, frames, _WIDTHS)
     best = every * n_headings + found.log_evidence.view(-1, n_headings).argmax(-1)
     return _by_wider(filter, frame, taken(state, best), taken(found, best))
+
+
+def _with_trunks(
+    filter: BodyKalmanFilter, state: BodyGaussian, rows: Int[Tensor, " N"]
+) -> BodyGaussian:
+    """Return starts, some of which have trunks of a length that is usual for their arms."""
+    if not len(rows):
+        return state
+    motion, scales = with_usual_trunk(filter.motion), filter.articulation.columns["scales"]
+    wanted = taken(state, rows)
+    mean = wanted.mean._replace(scales=motion.scale_mean.expand_as(wanted.mean.scales))
+    cov = wanted.cov.clone()
+    cov[:, scales, scales] = motion.scale_cov
+    return replaced(state, rows, wanted._replace(mean=mean, cov=cov))
 
 
 def _by_wider(

@@ -47,6 +47,8 @@ from torchpose.whole_body._keypoints.lifted_pose import (
     are_side_by_side,
     contradicts,
     corrected_by,
+    legs_guessed_by,
+    spread_of_hidden,
 )
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.lone_camera import (
@@ -228,7 +230,11 @@ class KeypointTracker(nn.Module):
         memory, lifted = self._lifted(stream, frame)
         if predicted is None:
             predicted = self.filter.predict(stream.state, stream.coasting)
-        likely = predicted if lifted is None else corrected_by(lifted, self.filter, predicted)
+        if lifted is None:
+            memory, spread, likely = self._with_guessed_legs(memory, frame, predicted)
+            stream = stream._replace(spread=spread)
+        else:
+            likely = corrected_by(lifted, self.filter, predicted)
         found = self.filter.correct(likely, frame)
         due = ~stream.begun | are_lost(stream.lost, self.filter.fps)
         if lifted is not None:
@@ -337,6 +343,31 @@ class KeypointTracker(nn.Module):
             return before or LifterMemory.none(frame.inlier[..., 0]), None
         lifted, memory = self.lifter(frame, before)
         return memory, lifted
+
+    def _with_guessed_legs(
+        self, memory: LifterMemory, frame: KeypointFrame, predicted: BodyGaussian
+    ) -> tuple[LifterMemory, Float[Tensor, "B J"], BodyGaussian]:
+        """Return what the lifter remembers, how unsure it is, and predictions with the legs that it guesses.
+
+        They are those of persons of whom no camera sees a hip.
+        """
+        rows, spread = self.filter.without_hips(frame), torch.zeros_like(frame.inlier[:, 0])
+        if not len(rows):
+            return memory, spread, predicted
+        lifted, after = self._guesser(frame.take(rows), taken(memory, rows))
+        likely = legs_guessed_by(lifted, self.filter, taken(predicted, rows))
+        spread[rows] = spread_of_hidden(lifted)
+        return replaced(memory, rows, after), spread, replaced(predicted, rows, likely)
+
+    @property
+    def _guesser(self) -> PoseLifter:
+        """Return the lifter of cameras that are apart; it is set up when it is needed first."""
+        rig, filter = self._rig[0], self.filter
+
+        def make() -> PoseLifter:
+            return PoseLifter(rig, filter.fps, filter.motion, filter.up).to(rig.matrix.device)
+
+        return derived(self, "guesser", (*rig.buffers(), *filter.motion.buffers()), make)
 
     def _with_lifted(
         self, stream: KeypointStream, lifted: Lifted | None, found: CorrectedBody

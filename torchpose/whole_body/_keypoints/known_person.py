@@ -14,6 +14,9 @@ from torchpose.priors._body_motion import BodyMotion
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
 _LENGTH_STD = 0.01  # of the log of a given bone length
 _TOLD_STD = 0.002  # of the log of the legs' length, in one camera, of a known person
+# Of the logarithm of a bone's scale against another's: mean and standard deviation over the walkers and the
+# persons of MHAD for choosing.
+_TRUNK = {("neck", "elbow"): (0.05, 0.06), ("hip", "shoulder"): (0.02, 0.08)}
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
 
 
@@ -59,6 +62,22 @@ def of_one_camera(motion: BodyMotion, told: bool = False) -> BodyMotion:
     std = _TOLD_STD if told else _LENGTH_STD
     cov = cov + _LENGTH_STD**2 * (torch.eye(len(cov)).to(cov) - along) + std**2 * along
     return _with(motion, {"scale_cov": (cov + cov.mT) / 2})
+
+
+def with_usual_trunk(motion: BodyMotion) -> BodyMotion:
+    """Return the prior of a person of whom no hip is seen; trunks end in the middle of shoulders and hips.
+
+    Sets of recordings have the pelvis in different places, so lengths of trunks are spread widely. Where no
+    hip is seen, nothing tells which place is meant, and the trunk goes with upper arms and shoulders.
+    """
+    groups, mean, cov = motion.articulation.groups, motion.scale_mean, motion.scale_cov
+    of = torch.eye(len(groups)).to(mean)
+    H = torch.stack([of[groups.index(bone)] - of[groups.index(other)] for bone, other in _TRUNK])
+    expected, std = torch.tensor(list(_TRUNK.values())).to(mean).unbind(-1)
+    gain = torch.linalg.solve(H @ cov @ H.mT + torch.diag(std.square()), H @ cov).mT
+    cov = cov - gain @ H @ cov
+    given = {"scale_mean": mean + gain @ (expected - H @ mean), "scale_cov": (cov + cov.mT) / 2}
+    return _with(motion, given)
 
 
 def length_of_legs(motion: BodyMotion) -> float:

@@ -57,6 +57,9 @@ _PASSES, _CLOSE = 4, 0.1  # metres, from where on the error of a ray counts less
 _NEAREST = 0.5  # metres from the camera
 _LEAST_UP = 0.2  # share of the upward direction in the image plane, below which it tells no roll
 _PELVIS = BODY_15.joint("pelvis")
+_NECK = BODY_15.joint("neck")
+_LEGS = [j for j, name in enumerate(BODY_15.names) if name.endswith(("knee", "ankle"))]
+_HIDDEN = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip"), *_LEGS]
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
 
 
@@ -242,16 +245,45 @@ def contradicts(
     return off.square().mean((-2, -1)) > _CONTRADICTION
 
 
-def corrected_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) -> BodyGaussian:
+def legs_guessed_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussian) -> BodyGaussian:
+    """Return the Gaussians given the legs of lifted joints, with the share of the priors' information.
+
+    Args:
+        lifted: [B, J], world axes. filter: whose states they are. state: [B].
+    """
+    std = torch.full_like(lifted.std, torch.inf)
+    std[..., _LEGS] = lifted.std[..., _LEGS] / math.sqrt(filter.transition.share)
+    alone = torch.ones_like(std[..., :1])
+    return corrected_by(Lifted(lifted.joints, std), filter, state, alone)
+
+
+def spread_of_hidden(lifted: Lifted) -> Float[Tensor, "B J"]:
+    """Return the standard deviations of hips and legs that are as far off as the pelvis is from the neck.
+
+    Where nothing was lifted, and of other joints, they are zero.
+    """
+    std = lifted.std.clone()
+    std[..., _PELVIS] = 0
+    spread = torch.zeros_like(std)
+    spread[..., _HIDDEN] = (std.square() + std[..., [_NECK]].square()).sqrt()[..., _HIDDEN]
+    return spread.masked_fill(spread.isinf(), 0.0)
+
+
+def corrected_by(
+    lifted: Lifted,
+    filter: BodyKalmanFilter,
+    state: BodyGaussian,
+    k: Float[Tensor, "B 1"] | None = None,
+) -> BodyGaussian:
     """Return the Gaussians given the joints that a network lifted: an iterated extended Kalman filter's.
 
     Args:
         lifted: [B, J], world axes; the standard deviation is infinite where it says nothing.
-        filter: whose states they are. state: [B].
+        filter: whose states they are. state: [B]. k: factor of the standard deviations, by default `telling`.
     """
     body, mean, cov = filter.articulation, state.mean, state.cov
     at_mean = body.linearise(mean)
-    k = telling(filter.maps, at_mean[0])[..., None]
+    k = telling(filter.maps, at_mean[0])[..., None] if k is None else k
     wanted = lifted.joints[..., _OTHERS, :]
     scale = 1 / (_FACTOR * k[..., None] * lifted.std[..., _OTHERS, None])
     wanted, scale = wanted.flatten(-2), scale.expand_as(wanted).flatten(-2)

@@ -34,7 +34,7 @@ from torchpose.whole_body._keypoints.nested import by_parts, mapped
 
 # On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
 # strangers to a network that was fitted without them.
-_LASTING = 1.25
+LASTING = 1.25
 _LASTING_UNSEEN, _FORGOTTEN = 2.5, 0.5  # seconds
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
 _MIDDLE = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
@@ -144,7 +144,7 @@ def untold_depths(
         away: from the camera to the joints, metres. spread: s_j, metres.
     """
     rays = torch.nn.functional.normalize(away, dim=-1)
-    return (_LASTING * spread).square()[..., None, None] * outer(rays)
+    return (LASTING * spread).square()[..., None, None] * outer(rays)
 
 
 def _guessed_in_room(poses: KeypointPoses) -> Float[Tensor, "*batch J"]:

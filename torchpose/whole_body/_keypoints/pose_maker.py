@@ -10,8 +10,9 @@ r_j from c to p_j, the covariance gets
 
     (s^2 (p_j - c) (p_j - c)^T + (1.25 s_j)^2 r_j r_j^T + s_l^2 I) / k^2.
 
-Relative to the pelvis p_0 they get the same with p_j - p_0 in place of p_j - c; k is 1 where one camera alone
-sees the person.
+Hips and legs of a person of whom none of several cameras sees a hip get (1.25 s_j)^2 I (`spread_of_hidden`).
+Relative to the pelvis p_0 joints in cameras side by side get the same with p_j - p_0 in place of p_j - c; k
+is 1 where one camera alone sees the person.
 """
 
 import torch
@@ -25,7 +26,11 @@ from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, Keypoi
 from torchpose.whole_body._keypoints.known_person import std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import telling
 from torchpose.whole_body._keypoints.nested import by_parts
-from torchpose.whole_body._keypoints.only_camera import relative_covariances, untold_depths
+from torchpose.whole_body._keypoints.only_camera import (
+    LASTING,
+    relative_covariances,
+    untold_depths,
+)
 
 _PELVIS = BODY_15.joint("pelvis")
 
@@ -79,6 +84,8 @@ class PoseMaker:
         lasting = self.lasting_std**2 * eye
         if self.side_by_side:
             lasting = lasting + self._hardly_told(joints, spread)
+        else:
+            lasting = lasting + (LASTING * spread).square()[..., None, None] * eye
         by_one = alone >= 0
         if not bool(by_one.any()):
             return joint_cov + lasting

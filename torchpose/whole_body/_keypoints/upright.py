@@ -13,6 +13,7 @@ from torchpose.whole_body._body_files import UP_AXES
 # Of the upward direction in the axes of the pelvis, to the left and forward.
 _MEAN, _STD = (0.0, -0.1), (0.08, 0.08)
 _TILT = (0.1, 0.1)  # radians, of the roll and pitch of a camera
+_ROLL, _PITCH = 0.05, 0.3  # the same of several cameras: tripods are level, lenses point down
 _FREEDOM = 4.0  # degrees of freedom of a lean's t distribution, for people who bend
 
 
@@ -70,9 +71,15 @@ def camera_up(rig: CameraRig) -> Upright:
 
 
 def level_cameras_up(rig: CameraRig) -> Upright:
-    """Return what is expected where several cameras are level on average."""
-    direction = torch.nn.functional.normalize(-rig.rotation[:, 1].mean(0), dim=-1)
-    return camera_up(rig)._replace(direction=direction)
+    """Return what is expected where several cameras are level, and roll less than they point up or down.
+
+    The direction u has the least sum of (x_c . u)^2 / roll^2 + (z_c . u)^2 / pitch^2, with the axes of
+    cameras to the right and ahead: cameras that look at a person from one side all point down to the other.
+    """
+    axes = torch.cat([rig.rotation[:, 0] / _ROLL, rig.rotation[:, 2] / _PITCH])
+    direction = torch.linalg.eigh(axes.mT @ axes).eigenvectors[:, 0]
+    above = -(rig.rotation[:, 1] @ direction).mean()
+    return camera_up(rig)._replace(direction=torch.where(above < 0, -direction, direction))
 
 
 def known_up(rig: CameraRig, up: str) -> Upright:
