@@ -116,7 +116,7 @@ def _given_camera(given: str, name: str | None, size: tuple[int, int] | None) ->
         fx, fy, cx, cy = (float(part) for part in given.split(","))
     except ValueError as error:
         raise CameraError(
-            f"--camera must be a TOML file or four numbers fx,fy,cx,cy in pixels, got {given!r}"
+            f"a camera must be a TOML file or four numbers fx,fy,cx,cy in pixels, got {given!r}"
         ) from error
     return PinholeCamera(fx, fy, cx, cy, *(size or (None, None)))
 

@@ -32,6 +32,7 @@ from torchpose.cli._track_body_output import (
     write_page,
     write_people,
 )
+from torchpose.cli._uncalibrated import camera_without_file, needs_no_file
 from torchpose.errors import CameraError, InputError, NobodySeenError
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ torchpose track-body cameras.toml cam1_json/ cam2_json/ --refine both --out resu
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --persons all --out result
 torchpose track-body cameras.toml cam1_json/ cam2_json/ --method mrpf --manifold walk --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 --detector rtmpose-m.onnx --out result
+torchpose track-body uncalibrated clip.mp4 --detector pose_landmarker_full.task --out result
 torchpose track-body cameras.toml cam*.npz --videos cam*.mp4 --silhouettes true --method apf --out result
 torchpose track-body cameras.toml cam*.npz --formats trc c3d bvh --up z --out result
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -79,7 +81,7 @@ def command() -> Command:
         spaced=("inputs", "background", "videos", "formats"),
         parse={"persons": parse_persons, "camera_names": parse_names},
         metavars={
-            "cameras": "CAMERAS",
+            "cameras": "FILE|fx,fy,cx,cy|uncalibrated",
             "inputs": "INPUT",
             "method": "|".join((KALMAN, *METHODS)),
             "background": "FILE",
@@ -130,7 +132,8 @@ def run(
     joints.csv, an overlay of every camera, report.html and pictures into a folder.
 
     Args:
-        cameras: TOML file with a table per camera: size, matrix, distortions, and its pose.
+        cameras: TOML file with a table per camera: size, matrix, distortions, and its pose; for keypoints
+            of one camera also fx,fy,cx,cy in pixels, or the word uncalibrated.
         inputs: an input per camera, in the order of the file, synchronised: keypoints (.npz, .csv or a folder
             of OpenPose JSON files), or a video or a folder of images.
         out: folder of the results.
@@ -181,7 +184,7 @@ def run(
     check_values(given.values)
     refuse_unsuited(given, by_keypoints)
     share_cores()
-    found, notes = _cameras(cameras, camera_names, len(inputs))
+    found, notes = _cameras(cameras, camera_names, inputs, videos)
     if camera_names is None:
         check_numbers(inputs, [camera.name for camera in found])
     job = BodyJob(
@@ -277,11 +280,15 @@ def _facts(
 
 
 def _cameras(
-    file: str, names: list[str] | None, n_inputs: int
+    file: str, names: list[str] | None, inputs: list[str], videos: list[str] | None
 ) -> "tuple[list[PinholeCamera], tuple[str, ...]]":
-    """Return the cameras of the inputs, and notes on the file."""
+    """Return the cameras of the inputs, and notes on the file, or on what is assumed without one."""
     from torchpose.camera._pinhole import camera_of_name, list_names, read_cameras
 
+    n_inputs = len(inputs)
+    if needs_no_file(file):
+        camera, assumed = camera_without_file(file, inputs, videos)
+        return [camera], assumed
     cameras, notes = read_cameras(file)
     names = list(cameras) if names is None else names
     found = [camera_of_name(cameras, name) for name in names]

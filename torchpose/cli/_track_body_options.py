@@ -12,6 +12,7 @@ from torchpose.cli._command import Given
 from torchpose.cli._options import Option, options_of, options_of_methods
 from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import KALMAN
+from torchpose.cli._uncalibrated import needs_no_file
 from torchpose.errors import InputError
 
 PYTHON_ONLY = frozenset({
@@ -125,6 +126,8 @@ def refuse_unsuited(given: Given, by_keypoints: bool) -> None:
             f"--method {method} takes keypoints: .npz, .csv or folders of OpenPose JSON files in place of "
             "videos, or --detector, which finds them"
         )
+    if needs_no_file(given.values["cameras"]):
+        _check_without_file(given, by_keypoints)
     if not by_keypoints:
         given.refuse(_OF_KEYPOINTS, "keypoints, and the inputs are videos without --detector")
     else:
@@ -140,6 +143,17 @@ def refuse_unsuited(given: Given, by_keypoints: bool) -> None:
             "--refine is for recordings of one person, and --persons is given; refine the cameras on a "
             "recording of one, and track with its refined_cameras.toml"
         )
+
+
+def _check_without_file(given: Given, by_keypoints: bool) -> None:
+    """Raise `InputError` for what a camera without a file cannot do."""
+    cameras = given.values["cameras"]
+    if not by_keypoints:
+        raise InputError(
+            f"{cameras} stands for the camera of keypoints; silhouettes need a TOML file with the cameras. "
+            "--detector finds keypoints in videos"
+        )
+    given.refuse(("camera_names",), f"camera files, and {cameras} stands for one camera")
 
 
 def _refuse_beside_keypoints(given: Given, method: str | None) -> None:
