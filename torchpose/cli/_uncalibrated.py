@@ -1,5 +1,6 @@
 """The camera of `torchpose track-body` without a camera file: of four numbers, or guessed."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,11 +15,7 @@ if TYPE_CHECKING:
 
 UNCALIBRATED = "uncalibrated"
 _NAME = "camera"
-_HALF_TURN = (
-    3.141592653589793,
-    0.0,
-    0.0,
-)  # about x: y of a level camera points down, of the world up
+_HALF_TURN = (math.pi, 0.0, 0.0)  # y of a level camera points down, that of the world up
 _AXES = (
     "the camera has no pose: the axes of the world are its own, x right, y up, z towards the viewer, "
     "with the origin in the lens; it is taken to be about level"
