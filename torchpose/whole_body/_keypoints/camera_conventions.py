@@ -36,6 +36,8 @@ _SIZES = (0.4, 1.6)  # of a person, by what is expected
 _MOST = 0.99  # share of the keypoints that is in the images
 _SCALES = ((1, 3), (1, 2), (2, 3), (3, 2), (2, 1), (3, 1))  # of images by the calibrated ones
 
+_FLIPS = (((1.0, -1.0, -1.0), "y and z"), ((-1.0, 1.0, -1.0), "x and z"), ((-1.0, -1.0, 1.0), "x and y"))
+
 _Pixels = Callable[[Tensor], Tensor]
 
 
@@ -90,7 +92,7 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
     for convention in conventions:
         if above and convention.tilts:
             continue
-        maps = _maps(rig, filter.maps, convention.rotation, convention.translation)
+        maps = maps_of_poses(rig, filter.maps, convention.rotation, convention.translation)
         moved = some
         if convention.pixels is not None:
             moved = some._replace(pixels=convention.pixels(some.pixels))
@@ -128,7 +130,7 @@ def _trunks(some: KeypointFrame) -> tuple[bool, bool]:
     return bool(above > _MOST_TRUNKS), bool(below > _MOST_TRUNKS)
 
 
-def _maps(rig: CameraRig, maps: RigMaps, rotation: Tensor, translation: Tensor) -> RigMaps:
+def maps_of_poses(rig: CameraRig, maps: RigMaps, rotation: Tensor, translation: Tensor) -> RigMaps:
     """Return the maps of cameras with other poses."""
     matrix = rig.matrix.to(maps.matrix)
     shift = (matrix @ translation[..., None]).squeeze(-1)
@@ -140,6 +142,27 @@ def image_conventions(rig: CameraRig) -> Iterator[Convention]:
     """Yield the other readings of keypoints in images."""
     yield from _of_images(rig)
     yield from (_of_size(rig, one, of) for one, of in _SCALES)
+
+
+def pose_conventions(rig: CameraRig) -> Iterator[Convention]:
+    """Yield the other readings of poses, those of one camera whose axes were turned included."""
+    R, t = rig.rotation, rig.translation
+    yield from _of_poses(R, t)
+    yield Convention(
+        "the translation has the other sign", "give -t: x_camera = R x_world + t", R, -t
+    )
+    for signs, axes in _FLIPS:
+        turn = torch.tensor(signs).to(R)
+        if axes != "y and z":  # that is OpenGL's
+            yield Convention(
+                f"its own axes {axes} point the other way",
+                "its axes are x to the right, y down, z ahead",
+                turn[:, None] * R, turn * t,
+            )  # fmt: skip
+        yield Convention(
+            f"the axes {axes} of the world point the other way",
+            "give the pose in the world of the other cameras", R * turn, t,
+        )  # fmt: skip
 
 
 def _of_images(rig: CameraRig) -> Iterator[Convention]:

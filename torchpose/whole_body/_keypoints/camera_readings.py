@@ -1,6 +1,7 @@
-"""Say what is wrong with the images of one camera: read in another way, they let cameras agree on joints."""
+"""Say what is wrong with images or pose of one camera: read in another way, they let cameras agree on joints."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,6 +11,8 @@ from torchpose.whole_body._keypoints.camera_conventions import (
     WELL_OF_TWO,
     Convention,
     image_conventions,
+    maps_of_poses,
+    pose_conventions,
 )
 from torchpose.whole_body._keypoints.camera_order import (
     MORE,
@@ -17,32 +20,64 @@ from torchpose.whole_body._keypoints.camera_order import (
     agreement_of_readings,
     some_frames,
 )
+from torchpose.whole_body._keypoints.joint_triangulation import agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame, RigMaps
+
+
+class _Reading(NamedTuple):
+    """Holds how well cameras agree if a camera is read in another way."""
+
+    agreed: float
+    convention: Convention
+    camera: int
 
 
 def notes_on_one_camera(
     rig: CameraRig, maps: RigMaps, frames: KeypointFrame, exchange: Exchange
 ) -> tuple[str, ...]:
-    """Return a note if cameras agree far better with the images of one of them read in another way.
+    """Return a note if cameras agree far better with images or pose of one of them read in another way.
 
     Args:
         rig, maps: the cameras. frames: keypoints [T, C, J]. exchange: of sides.
     """
     least = WELL_OF_TWO if len(rig) == 2 else WELL
     some = some_frames(frames)
-    given = float(agreement_of_readings(maps, some.map(lambda value: value[:, None]))[0])
+    given = float(agreement(maps, some))
+    best = max(
+        _best_images(rig, maps, some, exchange),
+        _best_pose(rig, maps, some),
+        key=lambda reading: reading.agreed,
+    )
+    if best.agreed < max(least, given + MORE):
+        return ()
+    return (
+        f"camera {rig.names[best.camera]}: cameras agree on {100 * best.agreed:.0f} % of the keypoints if, of "
+        f"this camera alone, {best.convention.said}, and on {100 * given:.0f} % as they are given, so poses "
+        f"may be wrong; {best.convention.advice}",
+    )
+
+
+def _best_images(
+    rig: CameraRig, maps: RigMaps, some: KeypointFrame, exchange: Exchange
+) -> _Reading:
+    """Return the best of the other readings of the images of one camera."""
     readings = list(_readings(rig, some, exchange))
     tried = [_one_by_one(some, other) for _, other in readings]
     side_by_side = KeypointFrame(*(torch.cat(values, 1) for values in zip(*tried, strict=True)))
     best, place = agreement_of_readings(maps, side_by_side).max(0)
-    if float(best) < max(least, given + MORE):
-        return ()
-    convention, name = readings[int(place) // len(rig)][0], rig.names[int(place) % len(rig)]
-    return (
-        f"camera {name}: cameras agree on {100 * float(best):.0f} % of the keypoints if, of this camera "
-        f"alone, {convention.said}, and on {100 * given:.0f} % as they are given, so poses may be wrong; "
-        f"{convention.advice}",
-    )
+    return _Reading(float(best), readings[int(place) // len(rig)][0], int(place) % len(rig))
+
+
+def _best_pose(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> _Reading:
+    """Return the best of the other readings of the pose of one camera."""
+    found = []
+    for convention in pose_conventions(rig):
+        for c in range(len(rig)):
+            R, t = rig.rotation.clone(), rig.translation.clone()
+            R[c], t[c] = convention.rotation[c], convention.translation[c]
+            fits = float(agreement(maps_of_poses(rig, maps, R, t), some))
+            found.append(_Reading(fits, convention, c))
+    return max(found, key=lambda reading: reading.agreed)
 
 
 def _readings(
