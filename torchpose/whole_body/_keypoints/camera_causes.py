@@ -4,8 +4,9 @@ A camera with errors e = (w, s, a, k) sees a joint p at
 
     u = K (g x, g y, 1),   X = exp(w) (R p + t) + s,   x, y = X_12 / X_3,   g = e^a (1 + k (x^2 + y^2)),
 
-with w a rotation, s a shift, a the log of a factor of the focal length, and k a radial distortion. Unknown are
-the joints of some frames, and those errors of one camera that are free. Steps of Gauss and Newton minimise
+with w a rotation, s a shift, a the log of a factor of the focal length, and k a radial distortion. Unknown
+are the joints of some frames, and those errors of one camera that are free. Steps of Gauss and Newton
+minimise
 
     nu/2 sum_tcj pi log(1 + |z - u|^2 / (nu R)) + e^T L e / 2
 
@@ -16,7 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig

@@ -36,7 +36,11 @@ _SIZES = (0.4, 1.6)  # of a person, by what is expected
 _MOST = 0.99  # share of the keypoints that is in the images
 _SCALES = ((1, 3), (1, 2), (2, 3), (3, 2), (2, 1), (3, 1))  # of images by the calibrated ones
 
-_FLIPS = (((1.0, -1.0, -1.0), "y and z"), ((-1.0, 1.0, -1.0), "x and z"), ((-1.0, -1.0, 1.0), "x and y"))
+_FLIPS = (
+    ((1.0, -1.0, -1.0), "y and z"),
+    ((-1.0, 1.0, -1.0), "x and z"),
+    ((-1.0, -1.0, 1.0), "x and y"),
+)
 
 _Pixels = Callable[[Tensor], Tensor]
 

@@ -20,7 +20,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, Keypoi
 _FRAMES = 150  # at most, of those that are looked at
 _WIDTHS = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)
 _LEAST_DELAY = 0.5  # frames
-_SURE_DELAY = 5.0  # standard deviations
+_SURE_DELAY = 4.0  # standard deviations; right cameras have up to 3
 _LEAST_TURN = 0.4  # degrees by which a camera sees joints elsewhere
 _SURE_TURN = 8.0  # standard deviations; right cameras stay below 2, turned ones have 25 to 90
 _WINDOW = 0.1  # seconds over which tracked joints are averaged before they give velocities
@@ -88,17 +88,29 @@ def doubt_cameras(
     return CameraDoubts(together.values[:, DELAY], together.std[:, DELAY], angles, sigmas)
 
 
-def notes_on_cameras(names: Sequence[str], doubts: CameraDoubts) -> tuple[str, ...]:
-    """Return notes on cameras that are surely and much wrong, and which option corrects them."""
-    size, std = doubts.delays.abs(), doubts.delay_std
-    late = (size > _LEAST_DELAY) & (size > _SURE_DELAY * std)
+def sure_delays(doubts: CameraDoubts) -> Float[Tensor, " C"]:
+    """Return delays, frames against the first camera, of cameras that surely have one, 0 of the others."""
+    size = doubts.delays.abs()
+    sure = (size > _LEAST_DELAY) & (size > _SURE_DELAY * doubts.delay_std)
+    return torch.where(sure, doubts.delays, 0.0)
+
+
+def notes_on_cameras(
+    names: Sequence[str], doubts: CameraDoubts, explained: bool = False
+) -> tuple[str, ...]:
+    """Return notes on cameras that are surely and much wrong, and which option corrects them.
+
+    Args:
+        names: of the cameras. doubts: about them. explained: whether something else than poses explains what
+            cameras see.
+    """
     notes = [
-        f"camera {names[c]} seems to have begun {_in_words(doubts.delays[c], std[c])} than {names[0]}; "
-        'refine="delays" (--refine delays) corrects that in recordings of one person'
-        for c in late.nonzero().flatten().tolist()
+        f"camera {names[c]} seems to have begun {_in_words(doubts.delays[c], doubts.delay_std[c])} than "
+        f'{names[0]}; refine="delays" (--refine delays) corrects that in recordings of one person'
+        for c in sure_delays(doubts).nonzero().flatten().tolist()
     ]
     turned = (doubts.turns > _LEAST_TURN) & (doubts.turn_sigmas > _SURE_TURN)
-    if bool(turned.any()):
+    if bool(turned.any()) and not explained:
         c = int(torch.where(turned, doubts.turn_sigmas, 0).argmax())
         notes.append(
             f"camera {names[c]} sees joints {float(doubts.turns[c]):.1f} degrees away from where the others "

@@ -1,4 +1,4 @@
-"""Say what is wrong with images or pose of one camera: read in another way, they let cameras agree on joints."""
+"""Say which camera is read in the wrong way: with other images or another pose of it, cameras agree."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -40,20 +40,23 @@ def notes_on_one_camera(
     Args:
         rig, maps: the cameras. frames: keypoints [T, C, J]. exchange: of sides.
     """
-    least = WELL_OF_TWO if len(rig) == 2 else WELL
     some = some_frames(frames)
     given = float(agreement(maps, some))
-    best = max(
+    images, (pose, next_pose) = (
         _best_images(rig, maps, some, exchange),
-        _best_pose(rig, maps, some),
-        key=lambda reading: reading.agreed,
+        _best_poses(rig, maps, some),
     )
+    best, least = max((images, WELL_OF_TWO), (pose, WELL), key=lambda pair: pair[0].agreed)
+    if len(rig) > 2:
+        least = WELL
+    elif best is pose and pose.agreed < max(images.agreed, next_pose.agreed) + MORE:
+        return ()
     if best.agreed < max(least, given + MORE):
         return ()
     return (
-        f"camera {rig.names[best.camera]}: cameras agree on {100 * best.agreed:.0f} % of the keypoints if, of "
-        f"this camera alone, {best.convention.said}, and on {100 * given:.0f} % as they are given, so poses "
-        f"may be wrong; {best.convention.advice}",
+        f"camera {rig.names[best.camera]}: cameras agree on {100 * best.agreed:.0f} % of the keypoints if, "
+        f"of this camera alone, {best.convention.said}, and on {100 * given:.0f} % as they are given, so "
+        f"poses may be wrong; {best.convention.advice}",
     )
 
 
@@ -68,8 +71,8 @@ def _best_images(
     return _Reading(float(best), readings[int(place) // len(rig)][0], int(place) % len(rig))
 
 
-def _best_pose(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> _Reading:
-    """Return the best of the other readings of the pose of one camera."""
+def _best_poses(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> tuple[_Reading, _Reading]:
+    """Return the two best of the other readings of the pose of one camera."""
     found = []
     for convention in pose_conventions(rig):
         for c in range(len(rig)):
@@ -77,7 +80,8 @@ def _best_pose(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> _Reading:
             R[c], t[c] = convention.rotation[c], convention.translation[c]
             fits = float(agreement(maps_of_poses(rig, maps, R, t), some))
             found.append(_Reading(fits, convention, c))
-    return max(found, key=lambda reading: reading.agreed)
+    first, second, *_ = sorted(found, key=lambda reading: reading.agreed, reverse=True)
+    return first, second
 
 
 def _readings(

@@ -13,7 +13,12 @@ from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.all_sides import notes_on_all_sides
-from torchpose.whole_body._keypoints.camera_notes import doubt_cameras, notes_on_cameras
+from torchpose.whole_body._keypoints.camera_cause_notes import notes_on_causes
+from torchpose.whole_body._keypoints.camera_notes import (
+    doubt_cameras,
+    notes_on_cameras,
+    sure_delays,
+)
 from torchpose.whole_body._keypoints.camera_order import agree_as_given, notes_on_order
 from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import RefinedCameras
@@ -150,7 +155,8 @@ class TrackBuilder:
         rig = self.rig if refined is None else refined.rig
         # turned cameras are said already
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange, turns=not turned)
-        return (*notes, *notes_on_cameras(self.rig.names, doubts))
+        causes = notes_on_causes(rig, frame, sure_delays(doubts))
+        return (*causes, *notes, *notes_on_cameras(self.rig.names, doubts, bool(causes)))
 
 
 def without_poses(track: BodyTrack) -> BodyTrack:
