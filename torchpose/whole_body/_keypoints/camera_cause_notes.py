@@ -37,6 +37,7 @@ _LEAST_GAINS = {"focal": 0.1, "lens": 0.03, "raw": 0.03}
 _OF_TWO = 0.08
 _BEFORE_OTHERS = 0.01  # gain by which a cause is ahead of all others
 _WORST_OF_TWO = 1.0  # misfit of two cameras that nothing explains; right ones have up to 0.6
+_MOST = 0.8  # share of keypoints that are nearer to joints than the distance that is said
 _LEAST_FOCAL = 0.04  # log of a factor
 
 _POSE, _TURN = tuple(range(POSE)), tuple(range(TURN))
@@ -48,7 +49,8 @@ class CameraCause(NamedTuple):
     Attributes:
         kind: "focal", "lens", "raw" (a lens is given that keypoints do not have), "turn" or "nothing".
         camera: which. value: the factor of the focal length, the distortion, or the turn in degrees.
-        given, explained: median distances of keypoints from joints, pixels, as given and without the error.
+        given, explained: distances from joints beyond which a fifth of the keypoints is, pixels, as given and
+            without the error.
     """
 
     kind: str
@@ -92,7 +94,7 @@ def find_cause(rig: CameraRig, frames: KeypointFrame) -> CameraCause | None:
     if not tell and not (n == 2 and cost > _WORST_OF_TWO):
         return None
     cameras = given.promise.topk(min(n, _MOST_CAMERAS)).indices
-    before = _median(given, 0, some)
+    before = _distance(given, 0, some)
     if n == 2:
         return _cause_of_two(rig, some, cameras, cost, count, before)
     return _cause_of_several(rig, some, cameras, cost, count, before)
@@ -114,7 +116,7 @@ def _cause_of_two(
     camera = causes[best][0]
     if cost - left > _OF_TWO and left < _WORST_OF_TWO:
         degrees = float(torch.rad2deg(found.errors[best, :TURN].norm()))
-        return CameraCause("turn", camera, degrees, before, _median(found, best, some))
+        return CameraCause("turn", camera, degrees, before, _distance(found, best, some))
     return CameraCause("nothing", camera, 0.0, before, before) if left > _WORST_OF_TWO else None
 
 
@@ -154,7 +156,7 @@ def _cause_of_several(
     if kind == "focal" and abs(float(errors[FOCAL])) < _LEAST_FOCAL:
         return None
     value = float(errors[FOCAL].exp()) if kind == "focal" else float(errors[LENS])
-    return CameraCause(kind, camera, value, before, _median(found, row, some))
+    return CameraCause(kind, camera, value, before, _distance(found, row, some))
 
 
 def _alike(one: _Tried, other: _Tried) -> bool:
@@ -187,8 +189,9 @@ def _distorted(rig: CameraRig, frames: KeypointFrame, camera: int) -> KeypointFr
     return frames._replace(pixels=pixels)
 
 
-def _median(found: Explained, row: int, frames: KeypointFrame) -> float:
-    return float(found.pixels[row][frames.inlier > 0].median())
+def _distance(found: Explained, row: int, frames: KeypointFrame) -> float:
+    """Return how far the farthest fifth of the keypoints is from joints, pixels."""
+    return float(found.pixels[row][frames.inlier > 0].quantile(_MOST))
 
 
 def _device(frames: KeypointFrame) -> torch.device:
@@ -214,9 +217,9 @@ def _of_several(rig: CameraRig, cause: CameraCause) -> str:
         said = f"its lens has a radial distortion k1 of about {cause.value:+.2f}{beside}"
         advice = "check its `distortions`: they seem to be missing, or those of another lens"
     return (
-        f"camera {rig.names[cause.camera]}: cameras agree far better if {said}: keypoints are then "
-        f"{cause.explained:.0f} pixels from common joints (median), and {cause.given:.0f} as it is given, so "
-        f"poses, and turns of cameras that are said, may be wrong; {advice}"
+        f"camera {rig.names[cause.camera]}: cameras agree far better if {said}: a fifth of the keypoints is "
+        f"then {cause.explained:.0f} pixels or more from common joints, and {cause.given:.0f} as cameras are "
+        f"given, so poses, and turns of cameras that are said, may be wrong; {advice}"
     )
 
 
@@ -229,7 +232,7 @@ def _of_two(rig: CameraRig, cause: CameraCause) -> str:
             "degrees, or something else were wrong with one of them"
         )
     return (
-        f"cameras {rig.names[0]} and {rig.names[1]} agree poorly: half of their keypoints are "
+        f"cameras {rig.names[0]} and {rig.names[1]} agree poorly: a fifth of their keypoints is "
         f"{cause.given:.0f} pixels or more from common joints{better}, so poses may be wrong; two cameras do "
         "not tell which of them it is: check the calibration of both (pose, focal length, lens, image size, "
         "metres) and whether one of them is late"

@@ -23,6 +23,8 @@ from torchpose.whole_body._keypoints.camera_order import (
 from torchpose.whole_body._keypoints.joint_triangulation import agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame, RigMaps
 
+_MORE_OF_TWO = 0.3  # by how much two cameras agree better by another pose of one of them
+
 
 class _Reading(NamedTuple):
     """Holds how well cameras agree if a camera is read in another way."""
@@ -47,11 +49,14 @@ def notes_on_one_camera(
         _best_poses(rig, maps, some),
     )
     best, least = max((images, WELL_OF_TWO), (pose, WELL), key=lambda pair: pair[0].agreed)
+    more = MORE
     if len(rig) > 2:
         least = WELL
-    elif best is pose and pose.agreed < max(images.agreed, next_pose.agreed) + MORE:
-        return ()
-    if best.agreed < max(least, given + MORE):
+    elif best is pose:
+        more = _MORE_OF_TWO
+        if pose.agreed < max(images.agreed, next_pose.agreed) + MORE:
+            return ()
+    if best.agreed < max(least, given + more):
         return ()
     return (
         f"camera {rig.names[best.camera]}: cameras agree on {100 * best.agreed:.0f} % of the keypoints if, "
