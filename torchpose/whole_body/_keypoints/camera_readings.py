@@ -20,9 +20,10 @@ from torchpose.whole_body._keypoints.camera_order import (
     agreement_of_readings,
     some_frames,
 )
-from torchpose.whole_body._keypoints.joint_triangulation import agreement
+from torchpose.whole_body._keypoints.joint_triangulation import agreeing, agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame, RigMaps
 
+_FEW = 0.7  # share of a camera's keypoints that agree, below which its pose may be one of another convention
 _MORE_OF_TWO = 0.3  # by how much two cameras agree better by another pose of one of them
 
 
@@ -44,20 +45,18 @@ def notes_on_one_camera(
     """
     some = some_frames(frames)
     given = float(agreement(maps, some))
-    images, (pose, next_pose) = (
-        _best_images(rig, maps, some, exchange),
-        _best_poses(rig, maps, some),
-    )
-    best, least = max((images, WELL_OF_TWO), (pose, WELL), key=lambda pair: pair[0].agreed)
-    more = MORE
-    if len(rig) > 2:
-        least = WELL
-    elif best is pose:
-        more = _MORE_OF_TWO
-        if pose.agreed < max(images.agreed, next_pose.agreed) + MORE:
-            return ()
-    if best.agreed < max(least, given + more):
+    two = len(rig) == 2
+    images = _best_images(rig, maps, some, exchange)
+    tried = [(images, max(WELL_OF_TWO if two else WELL, given + MORE))]
+    poses = _poses(rig, maps, some)
+    if poses:
+        others = max(reading.agreed for reading in (images, *poses[1:2]))
+        least = max(given + _MORE_OF_TWO, others + MORE) if two else given + MORE
+        tried.append((poses[0], max(WELL, least)))
+    good = [reading for reading, least in tried if reading.agreed >= least]
+    if not good:
         return ()
+    best = max(good, key=lambda reading: reading.agreed)
     return (
         f"camera {rig.names[best.camera]}: cameras agree on {100 * best.agreed:.0f} % of the keypoints if, "
         f"of this camera alone, {best.convention.said}, and on {100 * given:.0f} % as they are given, so "
@@ -76,17 +75,24 @@ def _best_images(
     return _Reading(float(best), readings[int(place) // len(rig)][0], int(place) % len(rig))
 
 
-def _best_poses(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> tuple[_Reading, _Reading]:
-    """Return the two best of the other readings of the pose of one camera."""
+def _poses(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> list[_Reading]:
+    """Return the other readings of the poses of cameras that disagree with others, the best one first."""
     found = []
-    for convention in pose_conventions(rig):
-        for c in range(len(rig)):
+    for c in _disagreeing(maps, some):
+        for convention in pose_conventions(rig):
             R, t = rig.rotation.clone(), rig.translation.clone()
             R[c], t[c] = convention.rotation[c], convention.translation[c]
             fits = float(agreement(maps_of_poses(rig, maps, R, t), some))
             found.append(_Reading(fits, convention, c))
-    first, second, *_ = sorted(found, key=lambda reading: reading.agreed, reverse=True)
-    return first, second
+    return sorted(found, key=lambda reading: reading.agreed, reverse=True)
+
+
+def _disagreeing(maps: RigMaps, some: KeypointFrame) -> list[int]:
+    """Return the cameras of whose keypoints few agree with others on a joint."""
+    there = some.inlier > 0
+    both = there & (there.sum(1, keepdim=True) >= 2)
+    share = (agreeing(maps, some) & both).sum((0, 2)) / both.sum((0, 2)).clamp_min(1)
+    return (share < _FEW).nonzero().flatten().tolist()
 
 
 def _readings(
