@@ -56,10 +56,9 @@ class Causes(NamedTuple):
     @classmethod
     def of(cls, causes: Sequence[tuple[int, Sequence[int]]], device: torch.device) -> "Causes":
         """Return the causes of cameras and the places of their errors."""
-        free = torch.zeros(len(causes), N_CAUSES, dtype=torch.bool, device=device)
-        for row, (_, places) in zip(free, causes, strict=True):
-            row[list(places)] = True
-        return cls(torch.tensor([camera for camera, _ in causes], device=device), free)
+        free = [[place in places for place in range(N_CAUSES)] for _, places in causes]
+        cameras = torch.tensor([camera for camera, _ in causes], device=device)
+        return cls(cameras, torch.tensor(free, device=device))
 
 
 class Explained(NamedTuple):
