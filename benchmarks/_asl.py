@@ -70,6 +70,11 @@ def read_clip(folder: Path, name: str, model: int = 1) -> Clip:
     )
 
 
+def begun(clip: Clip, n_frames: int | None) -> Clip:
+    """Return the first frames of a clip, or all."""
+    return Clip(*(x[:n_frames] if isinstance(x, Tensor) else x for x in clip))
+
+
 def pad(parts: list[Tensor]) -> tuple[Tensor, Tensor]:
     """Return sequences as one batch, padded with NaN (False), and their lengths."""
     lengths = torch.tensor([len(part) for part in parts])

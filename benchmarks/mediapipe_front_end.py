@@ -10,13 +10,14 @@ beside it stands how much its own full and heavy models differ.
 """
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
+from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, begun, pad, read_clip
 from benchmarks._command import run_command
 from benchmarks._data import data_folder
 from benchmarks._table_file import TableFile, save_text
@@ -37,11 +38,6 @@ GAPS = (10, 20, 30)
 SIGNERS = (("again", "brother", "help"), ("bird", "milk"), ("book", "learn"))
 HEADS, NECKS = (0.8, 0.9, 1.0, 1.1), (0.2, 0.27, 0.34)
 _QUICK_FRAMES = 36  # of the clip of a quick run
-
-
-def begun(clip: Clip) -> Clip:
-    """Return the first frames of a clip."""
-    return Clip(*(x[:_QUICK_FRAMES] if isinstance(x, Tensor) else x for x in clip))
 
 
 class Bench:
@@ -81,6 +77,12 @@ class Bench:
                 mask=self.visibility[rows][:, :, chosen] >= VISIBLE,
                 lengths=self.lengths[rows],
             )
+
+    def inferred(self, given: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return joints in the image that follow from head, neck and hands, for each of several points."""
+        rows = torch.arange(len(self.clips)).repeat(len(given))
+        joints = FRONT_ENDS["head, neck, hands"]
+        return self.track("filtered", joints, torch.cat([*given]), rows).joints2d.chunk(len(given))
 
     def off_by_clip(self, estimate: Tensor, group: str) -> Tensor:
         """Return the mean distance of a group from MediaPipe's joints, in shoulder widths [clips]."""
@@ -163,19 +165,16 @@ def inferred_table(bench: Bench, report: Report) -> None:
         "head and neck as read": (bench.points[:, :, HEAD], bench.points[:, :, NECK]),
     }
 
-    def add(name: str, points: Tensor) -> None:
-        found = bench.track("filtered", FRONT_ENDS["head, neck, hands"], points).joints2d
+    given: dict[str, Tensor] = {}
+    for name, (head, neck) in heads.items():
+        given[name] = bench.points.clone()
+        given[name][:, :, HEAD], given[name][:, :, NECK] = head, neck
+    given["the same with wrists as hands"] = bench.points.clone()
+    given["the same with wrists as hands"][:, :, list(HANDS)] = wrists
+    for name, found in zip(given, bench.inferred([*given.values()]), strict=True):
         pixels, widths = bench.off(found), bench.off(found, widths=True)
         keys = ("elbows", "shoulders")
         table.add(name, [*(pixels[k] for k in keys), *(widths[k] for k in keys)])
-
-    for name, (head, neck) in heads.items():
-        points = bench.points.clone()
-        points[:, :, HEAD], points[:, :, NECK] = head, neck
-        add(name, points)
-    points = bench.points.clone()
-    points[:, :, list(HANDS)] = wrists
-    add("the same with wrists as hands", points)
 
 
 def place_table(
@@ -194,14 +193,17 @@ def place_table(
     up = bench.points[:, :, HEAD] - middle
     wide = (bench.points[:, :, LEFT] - bench.points[:, :, RIGHT]).norm(dim=-1, keepdim=True)
     up = up / up.norm(dim=-1, keepdim=True) * wide
+    given = {}
+    for height, share in product(heads, necks):
+        points = given[height, share] = bench.points.clone()
+        points[:, :, HEAD] = middle + height * up
+        points[:, :, NECK] = middle + share * height * up
+    tracked = dict(zip(given, bench.inferred([*given.values()]), strict=True))
     errors = {}
     for height in heads:
         cells = []
         for share in necks:
-            points = bench.points.clone()
-            points[:, :, HEAD] = middle + height * up
-            points[:, :, NECK] = middle + share * height * up
-            found = bench.track("filtered", FRONT_ENDS["head, neck, hands"], points).joints2d
+            found = tracked[height, share]
             widths = bench.off(found, widths=True)
             cells.append(f"{widths['elbows']:.3f} / {widths['shoulders']:.3f}")
             parts = [bench.off_by_clip(found, g) for g in ("elbows", "shoulders")]
@@ -357,7 +359,7 @@ def main(
     names = CLIPS[:1] if quick else CLIPS
     clips, heavy = ([read_clip(folder, n, m) for n in names] for m in (1, 2))
     if quick:
-        clips, heavy = ([begun(clip) for clip in whole] for whole in (clips, heavy))
+        clips, heavy = ([begun(clip, _QUICK_FRAMES) for clip in whole] for whole in (clips, heavy))
     fitted = load_prior(prior)
     bench = Bench(clips, heavy, fitted)
     report = Report("MediaPipe as the measuring front end")
@@ -369,7 +371,7 @@ def main(
     jitter_tables(bench, report, tracks)
     gap_table(bench, report, *((60, GAPS[:1]) if quick else (10,)))
     inferred_table(bench, report)
-    some = slice(1 if quick else None)
+    some = slice(2 if quick else None)
     place_table(bench, report, HEADS[some], NECKS[some])
     by_clip_table(bench, report, tracks)
     space_table(bench, report, tracks)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
+from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, begun, read_clip
 from benchmarks._command import run_command
 from benchmarks._data import data_folder
 from benchmarks._table_file import TableFile, save_text
@@ -37,18 +37,21 @@ TRUNK = (HEAD, UPPER_BODY.index("neck"))
 HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
 THRESHOLDS = (0.2, 0.3, 0.5, 0.7, 1.0)
 SHOWN = "again"
+_QUICK_FRAMES = 40  # of the clip of a quick run
 Method = Callable[[Clip], Tensor]
 
 
-def from_video(folder: Path, prior: UpperBodyPrior, background: bool) -> Method:
-    """Return a method: joints [T, 8, 2] of the person seen longest, by the pipeline."""
+def from_video(
+    folder: Path, prior: UpperBodyPrior, background: bool, most: int | None = None
+) -> Method:
+    """Return a method: joints [T, 8, 2] of the person seen longest, by the pipeline, in `most` frames."""
 
     def run(clip: Clip) -> Tensor:
         video = open_video(folder / f"{clip.name}.mkv")
         camera = PinholeCamera.from_image_size(*video.size)
         tracker = VideoTracker(prior, camera, fps=video.fps or FPS, background=background)
         own: list[int] = []
-        people = tracker(watched(video, own))
+        people = tracker(watched(video, own, most))
         joints = torch.full((own[-1] + 1, 8, 2), torch.nan, dtype=clip.points.dtype)
         if people:
             found = people[0].track.joints2d[0]
@@ -63,14 +66,19 @@ def from_video(folder: Path, prior: UpperBodyPrior, background: bool) -> Method:
     return run
 
 
-def watched(frames: Iterable[VideoFrame], own: list[int]) -> Iterator[VideoFrame]:
+def watched(
+    frames: Iterable[VideoFrame], own: list[int], most: int | None = None
+) -> Iterator[VideoFrame]:
     """Yield the frames, and add the indices of those that differ from the one before to `own`.
 
-    A video that lacks a frame is read with the one before twice; MediaPipe saw what there is.
+    It stops after `most` that differ. A video that lacks a frame is read with the one before twice;
+    MediaPipe saw what there is.
     """
     last = None
     for frame in frames:
         if last is None or not np.array_equal(frame.image, last):
+            if len(own) == most:
+                return
             own.append(int(frame.index))
         last = frame.image.copy()
         yield frame
@@ -227,15 +235,17 @@ def main(
         threads: cores.
         out: file for the same as Markdown, or a folder.
         pictures: folder for pcp.png and errors-over-time.png.
-        quick: one clip, to see that it works.
+        quick: the beginning of one clip, to see that it works.
     """
     torch.set_num_threads(threads)
     folder = data_folder(data, "video_asl")
     clips = [read_clip(folder, name) for name in (CLIPS[:1] if quick else CLIPS)]
+    most = _QUICK_FRAMES if quick else None
+    clips = [begun(clip, most) for clip in clips]
     fitted = load_prior(prior)
     methods = {
-        "video": from_video(folder, fitted, False),
-        "video, background model": from_video(folder, fitted, True),
+        "video": from_video(folder, fitted, False, most),
+        "video, background model": from_video(folder, fitted, True, most),
         "MediaPipe's head, neck, hands": from_landmarks(fitted, (*TRUNK, *HANDS)),
         "the same, smoothed": from_landmarks(fitted, (*TRUNK, *HANDS), "full"),
         "MediaPipe's head and neck": from_landmarks(fitted, TRUNK),

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 pytest.importorskip("cv2")
+from benchmarks.hand_network import training
 from benchmarks.hand_network.changes import bare_skin, bordered, exchanged, lit, mirrored, moved
 from benchmarks.hand_network.clips import BURN_IN, FOLDS, PEOPLE, SIGNERS, Labels, Windows
 from benchmarks.hand_network.failures import Found, draw_failures, failures
@@ -125,7 +126,8 @@ def test_the_loss_is_least_at_the_label():
     assert float(_loss(gone, batch.places, batch.seen)) < 0.05 < loss(3, 3)
 
 
-def test_a_fit_is_a_network_that_is_ready_and_the_same_again():
+def test_a_fit_is_a_network_that_is_ready_and_the_same_again(monkeypatch):
+    monkeypatch.setattr(training, "BATCH", 4)
     hands = windows(2)
     both = {name: torch.cat([getattr(hands, name)] * 2, 1) for name in ("places", "seen")}
     own = hands._replace(lab=torch.zeros(2, 3, 176, 192, dtype=torch.uint8), **both)

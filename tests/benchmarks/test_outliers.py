@@ -49,6 +49,7 @@ def test_a_median_takes_a_single_outlier_out_and_keeps_what_is_missing():
 def test_it_runs_on_a_few_recordings(run_here, few_people, tmp_path, monkeypatch):
     data_dir_or_skip("kinect_utd_mhad")
     monkeypatch.setattr(outliers, "SIZES", (1e4,))
+    monkeypatch.setattr(outliers, "JOINTS", ("neck",))
     options = ("--quick", "--every", "4", "--data", str(few_people), "--out", str(tmp_path))
     printed = run_here("outliers", *options)
     rows = {

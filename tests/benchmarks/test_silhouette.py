@@ -196,8 +196,8 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
 
 def test_other_conditions(folder, tmp_path, clips, monkeypatch):
     """Cameras of a file, one camera, a published exponent, a looped walk, a found first pose."""
-    search = partial(filters.find_first_pose, n_particles=600, n_tracking=100)
-    monkeypatch.setattr(filters, "find_first_pose", search)  # with a third of the particles
+    search = partial(filters.find_first_pose, n_particles=200, n_tracking=50)
+    monkeypatch.setattr(filters, "find_first_pose", search)  # with a ninth of the particles
     rig = body_clips.place_cameras(clips[4])  # p2's first trial
     from torchpose.camera import PinholeCamera
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks import ub_people
+from benchmarks import _gaps, ub_people
 from benchmarks._people_tables import BASELINE, MAIN, MEAN_POSE, SMOOTHED, UNCALIBRATED
 from tests.evaluation.recordings import small_recipe, write_people
 from torchpose.errors import InputError, OutputError, OverlapError
@@ -21,10 +21,12 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def result(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    report = ub_people.run(
-        data.parent, out, progress=False, quick=True, n_components=3, n_gap_sequences=1,
-        recipe=small_recipe,
-    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_gaps, "_DURATION", 3.5)  # s: a second before, in and after the gap
+        report = ub_people.run(
+            data.parent, out, progress=False, quick=True, n_components=3, n_gap_sequences=1,
+            recipe=small_recipe,
+        )  # fmt: skip
     return report, out
 
 
