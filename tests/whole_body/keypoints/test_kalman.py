@@ -282,8 +282,9 @@ def test_who_comes_late_has_no_earlier_pose(smoothing):
     )
     assert found.first_frame == 6 and len(found) == 6
     assert found.notes == (*alone.notes, late_note(6, TOO_FEW)[0])
-    torch.testing.assert_close(found.joints3d, alone.joints3d, rtol=0, atol=0)
-    torch.testing.assert_close(found.state, alone.state, rtol=0, atol=0)
+    # where a frame lies in memory may decide the last bit of a product
+    torch.testing.assert_close(found.joints3d, alone.joints3d, rtol=0, atol=1e-14)
+    torch.testing.assert_close(found.state, alone.state, rtol=0, atol=1e-14)
     assert found.body.height == pytest.approx(0.9, abs=0.1)
     together = tracker(small.rig)(keypoints=torch.stack([late, late.flip(0)]), smoothing=smoothing)
     assert [(one.first_frame, len(one)) for one in together] == [(6, 6), (0, 12)]
