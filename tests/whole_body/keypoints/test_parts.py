@@ -223,6 +223,34 @@ def test_one_camera_fixes_the_legs_and_leaves_the_prior_alone(motion):
     torch.testing.assert_close(motion.scale_cov, before)
 
 
+def test_where_legs_are_has_the_slope_of_differences():
+    """In axes of the shoulders, which stay while knees and ankles move."""
+    body, upright = Articulation(), camera_up(ring(1))
+    point, parts = random_point(body), body.skeleton.parts
+    limbs = [parts.index(f"{side}_{n}") for side in ("left", "right") for n in ("thigh", "shank")]
+    turns = [i for i, part in enumerate(body.axis_part.tolist()) if part in limbs]
+    legs = upright.legs(body, point)
+    for column in (body.columns["rotations"].start + i for i in turns):
+        step = torch.zeros(body.dim, dtype=torch.float64)
+        step[column] = 1e-6
+        ahead, behind = (upright.legs(body, body.moved(point, s)).gap for s in (step, -step))
+        slope = (behind - ahead) / 2e-6
+        torch.testing.assert_close(legs.jacobian[..., column], slope, rtol=0, atol=1e-8)
+
+
+def test_trunks_are_expected_upright_whatever_the_pelvis_does():
+    body, upright = Articulation(), camera_up(ring(1))
+    point = random_point(body)
+    lean = upright.trunk_lean(body, point)
+    joints = body.joints(point)
+    pairs = [[body.skeleton.joint(f"{side}_{n}") for side in ("left", "right")]
+             for n in ("shoulder", "hip")]  # fmt: skip
+    trunk = joints[..., pairs[0], :].mean(-2) - joints[..., pairs[1], :].mean(-2)
+    sine = (lean.gap.square().sum(-1)).sqrt()
+    upward = (trunk @ upright.direction) / trunk.norm(dim=-1)
+    torch.testing.assert_close(sine.square() + upward.square(), torch.ones_like(sine))
+
+
 def test_who_bends_far_is_expected_upright_with_less_force():
     """The variance of the lean grows with the square of the gap, as that of a t distribution does."""
     body, upright = Articulation(), camera_up(ring(1))

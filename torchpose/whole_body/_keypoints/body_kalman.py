@@ -58,14 +58,20 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     weigh,
 )
 from torchpose.whole_body._keypoints.nested import replaced, taken
-from torchpose.whole_body._keypoints.upright import Upright, level_cameras_up, upright_of
+from torchpose.whole_body._keypoints.upright import (
+    Expected,
+    Upright,
+    level_cameras_up,
+    upright_of,
+)
 
 FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
 
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which no camera sees a hip
-_HELD = 20.0  # shares of the information about leans that such a body gets
+_HELD = 20.0  # shares of the information about the lean of a trunk that such a body gets
+_HELD_PELVIS = 2.0  # and about that of its pelvis
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
@@ -235,11 +241,15 @@ class BodyKalmanFilter(nn.Module):
         solved = torch.cholesky_solve(L.mT @ (G @ y[..., None]), chol)
         step = (HP.mT @ (y[..., None] - L @ solved)).squeeze(-1)
         state = state._replace(mean=a.moved(state.mean, step), cov=state.cov - U.mT @ U)
-        return state if self.upright is None else self._erected(state, self.upright, share)
+        if self.upright is None:
+            return state
+        return self._told(state, self.upright.lean(a, state.mean), share)
 
-    def _erected(self, state: BodyGaussian, upright: Upright, share: float) -> BodyGaussian:
-        """Return the Gaussian after a share of the information about the lean of the pelvis."""
-        gap, variance, H = upright.lean(self.articulation, state.mean)
+    def _told(
+        self, state: BodyGaussian, expected: Expected, share: float | Float[Tensor, "B K"]
+    ) -> BodyGaussian:
+        """Return the Gaussian after a share of the information about what is expected of a body."""
+        gap, variance, H = expected
         HP = H @ state.cov
         spread = HP @ H.mT + torch.diag_embed(variance / share)
         chol = torch.linalg.cholesky((spread + spread.mT) / 2)
@@ -283,7 +293,17 @@ class BodyKalmanFilter(nn.Module):
 
     def _held(self, state: BodyGaussian) -> BodyGaussian:
         """Return Gaussians after more information about leans, without which hips that are not seen drift."""
-        return self._erected(state, self._up, _HELD * self.transition.share)
+        body, share = self.articulation, self.transition.share
+        state = self._told(state, self._up.lean(body, state.mean), _HELD_PELVIS * share)
+        return self._told(state, self._up.trunk_lean(body, state.mean), _HELD * share)
+
+    def with_usual_legs(self, state: BodyGaussian, share: Float[Tensor, "B 12"]) -> BodyGaussian:
+        """Return Gaussians after shares of the information about where legs are below the hips on average.
+
+        Args:
+            state: of [B]. share: of every joint along every axis, as of `Upright.legs`; not zero.
+        """
+        return self._told(state, self._up.legs(self.articulation, state.mean), share)
 
     def _corrected_as_predicted(
         self, state: BodyGaussian, frame: KeypointFrame, readings: KeypointFrame

@@ -48,6 +48,7 @@ from torchpose.whole_body._keypoints.lifted_pose import (
     contradicts,
     corrected_by,
     legs_guessed_by,
+    shares_of_usual,
     spread_of_hidden,
 )
 from torchpose.whole_body._keypoints.lifting_network import Lifted
@@ -73,6 +74,7 @@ from torchpose.whole_body._keypoints.only_camera import OnlyCamera
 from torchpose.whole_body._keypoints.pose_maker import PoseMaker
 from torchpose.whole_body._keypoints.watched_cameras import by_right_cameras
 
+_LEAST_SHARE = 1e-9  # of information, of nothing
 # What is found in a frame; the last are those who begin with it.
 _Found = tuple[KeypointStream, CorrectedBody, Bool[Tensor, " B"]]
 
@@ -231,7 +233,7 @@ class KeypointTracker(nn.Module):
         if predicted is None:
             predicted = self.filter.predict(stream.state, stream.coasting)
         if lifted is None:
-            memory, spread, likely = self._with_guessed_legs(memory, frame, predicted)
+            memory, spread, likely = self._with_guessed_legs(stream, memory, frame, predicted)
             stream = stream._replace(spread=spread)
         else:
             likely = corrected_by(lifted, self.filter, predicted)
@@ -250,6 +252,8 @@ class KeypointTracker(nn.Module):
             alone=torch.where(due, NOBODY, stream.alone),
             memory=memory,
         )
+        if lifted is None:
+            stream = stream._replace(unseen=stream.unseen.masked_fill(due[:, None], torch.inf))
         return self._with_lifted(stream, lifted, found), found, due
 
     # --- one of several cameras -------------------------------------------------------------------
@@ -345,7 +349,11 @@ class KeypointTracker(nn.Module):
         return memory, lifted
 
     def _with_guessed_legs(
-        self, memory: LifterMemory, frame: KeypointFrame, predicted: BodyGaussian
+        self,
+        stream: KeypointStream,
+        memory: LifterMemory,
+        frame: KeypointFrame,
+        predicted: BodyGaussian,
     ) -> tuple[LifterMemory, Float[Tensor, "B J"], BodyGaussian]:
         """Return what the lifter remembers, how unsure it is, and predictions with the legs that it guesses.
 
@@ -356,6 +364,9 @@ class KeypointTracker(nn.Module):
             return memory, spread, predicted
         lifted, after = self._guesser(frame.take(rows), taken(memory, rows))
         likely = legs_guessed_by(lifted, self.filter, taken(predicted, rows))
+        share = self.filter.transition.share * shares_of_usual(stream.unseen[rows])
+        if bool((share > 0).any()):
+            likely = self.filter.with_usual_legs(likely, share.clamp_min(_LEAST_SHARE))
         spread[rows] = spread_of_hidden(lifted)
         return replaced(memory, rows, after), spread, replaced(predicted, rows, likely)
 
@@ -372,13 +383,14 @@ class KeypointTracker(nn.Module):
     def _with_lifted(
         self, stream: KeypointStream, lifted: Lifted | None, found: CorrectedBody
     ) -> KeypointStream:
-        """Return the stream with how unsure lifted joints are, and for how long they have not been seen."""
+        """Return the stream with how unsure lifted joints are, and for how long joints have not been seen."""
+        seen = found.weighed.inlier.amax(1) > 0.5
+        unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
+        stream = stream._replace(unseen=unseen)
         if lifted is None:
             return stream
         spread = torch.where(lifted.std.isfinite(), lifted.std, stream.spread)
-        seen = found.weighed.inlier.amax(1) > 0.5
-        unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
-        return stream._replace(spread=spread, unseen=unseen)
+        return stream._replace(spread=spread)
 
     def _recalled(self, stream: KeypointStream, frame: KeypointFrame) -> LifterMemory:
         """Return what the lifter remembers, nothing where nobody has been seen for long.

@@ -44,6 +44,7 @@ from torchpose.whole_body._keypoints.lifting_network import (
     shipped_lifting_network,
 )
 from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.upright import LEGS as USUAL_LEGS
 from torchpose.whole_body._keypoints.upright import camera_up, upright_of
 
 # On the network's standard deviations, which are those of persons that it was fitted to.
@@ -60,6 +61,8 @@ _PELVIS = BODY_15.joint("pelvis")
 _NECK = BODY_15.joint("neck")
 _LEGS = [j for j, name in enumerate(BODY_15.names) if name.endswith(("knee", "ankle"))]
 _HIDDEN = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip"), *_LEGS]
+_REMEMBERED = 1.0  # seconds for which legs are expected as they were seen
+_USUAL_SHARE = 10.0  # of the information about usual legs, afterwards, against that of the priors
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
 
 
@@ -255,6 +258,16 @@ def legs_guessed_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussia
     std[..., _LEGS] = lifted.std[..., _LEGS] / math.sqrt(filter.transition.share)
     alone = torch.ones_like(std[..., :1])
     return corrected_by(Lifted(lifted.joints, std), filter, state, alone)
+
+
+def shares_of_usual(unseen: Float[Tensor, "B J"]) -> Float[Tensor, "B 12"]:
+    """Return shares of the information about usual legs: none for a second after they were seen.
+
+    Args:
+        unseen: seconds since joints were seen.
+    """
+    long = (unseen[:, USUAL_LEGS] - _REMEMBERED).clamp(0.0, 1.0)
+    return (_USUAL_SHARE * long).repeat_interleave(3, -1)
 
 
 def spread_of_hidden(lifted: Lifted) -> Float[Tensor, "B J"]:

@@ -3,22 +3,38 @@
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_choice
 from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_files import UP_AXES
 
 # Of the upward direction in the axes of the pelvis, to the left and forward.
 _MEAN, _STD = (0.0, -0.1), (0.08, 0.08)
+# The same of the trunk, from the middle of the hips to that of the shoulders, in axes of the shoulders.
+_TRUNK_MEAN, _TRUNK_STD = (0.0, 0.0), (0.08, 0.08)
 _TILT = (0.1, 0.1)  # radians, of the roll and pitch of a camera
 _ROLL, _PITCH = 0.05, 0.3  # the same of several cameras: tripods are level, lenses point down
 _FREEDOM = 4.0  # degrees of freedom of a lean's t distribution, for people who bend
 
 
-class Lean(NamedTuple):
-    """Holds the gap [B, 2] between expected and actual lean, its variance, and its derivative [B, 2, N]."""
+_SHOULDERS = [BODY_15.joint("left_shoulder"), BODY_15.joint("right_shoulder")]
+_HIPS = [BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
+
+
+LEGS = [BODY_15.joint(f"{side}_{n}") for n in ("knee", "ankle") for side in ("left", "right")]
+"""Joints of `Upright.legs`."""
+# From the middle of the hips to the left, up and ahead, in lengths of a leg. Means of positions, which are
+# nearer than where a straight leg ends.
+_USUAL = ((0.11, -0.43, 0.11), (-0.11, -0.43, 0.11), (0.11, -0.90, 0.0), (-0.11, -0.90, 0.0))
+_USUAL_STD = ((0.07, 0.08, 0.15),) * 2 + ((0.10, 0.10, 0.25),) * 2
+
+
+class Expected(NamedTuple):
+    """Holds gaps [B, K] between expected and actual values, their variances, and derivatives [B, K, N]."""
 
     gap: Tensor
     variance: Tensor
@@ -38,7 +54,7 @@ class Upright(NamedTuple):
     mean: Tensor
     variance: Tensor
 
-    def lean(self, articulation: Articulation, point: BodyPoint) -> Lean:
+    def lean(self, articulation: Articulation, point: BodyPoint) -> Expected:
         """Return how far bodies are from the expected lean: a turn d changes R^T u by (R^T u) x d."""
         up = (point.rotations[..., 0, :, :].mT @ self.direction[:, None]).squeeze(-1)
         x, y, z = up.unbind(-1)
@@ -48,8 +64,51 @@ class Upright(NamedTuple):
         start = articulation.columns["rotations"].start
         jacobian[..., start : start + 3] = turned
         gap = self.mean - torch.stack([x, z], -1)
-        far = (gap.square() / self.variance).sum(-1, keepdim=True)
-        return Lean(gap, self.variance * (_FREEDOM + far) / (_FREEDOM + 2), jacobian)
+        return Expected(gap, _variance_of(gap, self.variance), jacobian)
+
+    def axes_of(self, joints: Float[Tensor, "*batch J 3"]) -> Float[Tensor, "*batch 3 3"]:
+        """Return the directions to the left of the shoulders, up, and ahead, world axes."""
+        across = joints[..., _SHOULDERS[0], :] - joints[..., _SHOULDERS[1], :]
+        level = across - (across @ self.direction)[..., None] * self.direction
+        left = torch.nn.functional.normalize(level, dim=-1)
+        up = self.direction.expand_as(left)
+        return torch.stack([left, up, torch.linalg.cross(left, up)], -2)
+
+    def trunk_lean(self, articulation: Articulation, point: BodyPoint) -> Expected:
+        """Return how far trunks, from the middle of the hips to that of the shoulders, are from upright.
+
+        The derivative is that of turns: lengths of trunks, and axes of shoulders, are taken as they are.
+        """
+        joints, moved = articulation.linearise(point)
+        axes = self.axes_of(joints)[..., [0, 2], :]
+        trunk = (joints[..., _SHOULDERS, :] - joints[..., _HIPS, :]).mean(-2)
+        length = trunk.norm(dim=-1)[..., None]
+        turned = (moved[..., _SHOULDERS, :, :] - moved[..., _HIPS, :, :]).mean(-3)
+        mean = torch.tensor(_TRUNK_MEAN).to(length)
+        gap = mean - (axes @ trunk[..., None]).squeeze(-1) / length
+        std, own = (torch.tensor(v).to(length) for v in (_TRUNK_STD, _STD))
+        variance = self.variance - own.square() + std.square()
+        return Expected(gap, _variance_of(gap, variance), axes @ turned / length[..., None])
+
+    def legs(self, articulation: Articulation, point: BodyPoint) -> Expected:
+        """Return how far knees and ankles are from where they are on average, [B, 12]; see `LEGS`."""
+        joints, moved = articulation.linearise(point)
+        axes = self.axes_of(joints)
+        hips = joints[..., _HIPS, :].mean(-2, keepdim=True)
+        below = (joints[..., LEGS, :] - hips) @ axes.mT
+        turned = moved[..., LEGS, :, :] - moved[..., _HIPS, :, :].mean(-3, keepdim=True)
+        length = articulation.bones(point).norm(dim=-1)[..., LEGS].sum(-1)[..., None, None] / 2
+        mean, std = (length * torch.tensor(values).to(length) for values in (_USUAL, _USUAL_STD))
+        jacobian = axes[..., None, :, :] @ turned
+        return Expected(
+            (mean - below).flatten(-2), std.square().flatten(-2), jacobian.flatten(-3, -2)
+        )
+
+
+def _variance_of(gap: Float[Tensor, "*batch 2"], variance: Tensor) -> Float[Tensor, "*batch 2"]:
+    """Return the variance with which a gap counts, that of a t distribution; see `Upright`."""
+    far = (gap.square() / variance).sum(-1, keepdim=True)
+    return variance * (_FREEDOM + far) / (_FREEDOM + 2)
 
 
 def upright_of(rig: CameraRig, up: str | None) -> Upright | None:
