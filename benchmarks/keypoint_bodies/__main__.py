@@ -12,13 +12,15 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR --heights [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --sitting [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --lying [--lifters FILE]
+    python -m benchmarks.keypoint_bodies --data DIR --desk
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
 The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
-is. The fourth shows people who sit to one camera, the fifth people who lie. The sixth prints what the
-constants of the filters of single joints were chosen by. The seventh fits the network that comes with
-torchpose and lifts the keypoints of one camera.
+is. The fourth shows people who sit to one camera, the fifth people who lie. The sixth shows people whose
+hips and legs are hidden to two cameras. The seventh prints what the constants of the filters of single
+joints were chosen by. The eighth fits the network that comes with torchpose and lifts the keypoints of one
+camera.
 """
 
 from __future__ import annotations
@@ -47,9 +49,10 @@ from benchmarks.keypoint_bodies.clips import (
     read_clips,
     read_kinect,
 )
+from benchmarks.keypoint_bodies.desk import add_desk_table
 from benchmarks.keypoint_bodies.lifting import fit_shipped
 from benchmarks.keypoint_bodies.lying import add_lying_table
-from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, Method, methods_of, takes
+from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, OURS, Method, methods_of, takes
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.sitting import add_sitting_table
 from benchmarks.keypoint_bodies.tables import add_table
@@ -72,6 +75,7 @@ def main(
     heights: bool = False,
     sitting: bool = False,
     lying: bool = False,
+    desk: bool = False,
     choose: bool = False,
     fit: Path | None = None,
     quick: bool = False,
@@ -88,6 +92,7 @@ def main(
         heights: whether one camera is told how high it is, in place of the tables.
         sitting: whether people sit, seen by one camera, in place of the tables.
         lying: whether people lie, seen by one camera, in place of the tables.
+        desk: whether hips and legs are hidden to two cameras, in place of the tables; of methods `OURS`.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
@@ -97,6 +102,11 @@ def main(
         fit_shipped(data, quick).save(fit)
         return
     report = Report("Whole bodies from keypoints")
+    if desk:
+        ours = [name for name in methods if name in OURS]
+        add_desk_table(report, methods_of(ours, data, None, quick), data, quick)
+        print_tables(report, out)
+        return
     names = CHOOSING if choose else SCORED
     if quick:
         names = {folder: chosen[:1] for folder, chosen in names.items()}

@@ -35,9 +35,22 @@ from torchpose.evaluation import Report
 from torchpose.evaluation._trials import settings_hash
 from torchpose.metrics import coverage
 
-__all__ = ["add_sitting_table", "sitting_clips"]
+__all__ = ["add_sitting_table", "read_sitters", "sitting_clips"]
 
-_PERSONS = {"s09": "a05_wave_two_hands", "s10": "a07_clap", "s11": "a04_punch", "s12": "a08_throw"}
+SCORED_SITTERS = {
+    "s09": "a05_wave_two_hands",
+    "s10": "a07_clap",
+    "s11": "a04_punch",
+    "s12": "a08_throw",
+}
+"""Persons who are scored, each with the recording that its arms are of."""
+CHOOSING_SITTERS = {
+    "s01": "a05_wave_two_hands",
+    "s02": "a07_clap",
+    "s03": "a04_punch",
+    "s04": "a08_throw",
+}
+"""The same of persons for choosing."""
 _VIEWS = {"front": 0.0, "oblique": 45.0, "side": 90.0}  # degrees to the person's left
 _HEIGHTS, _DISTANCE, _AIM = (0.75, 1.3, 2.2), 2.5, 0.7  # metres; heights above the floor
 _SOLE = 0.08  # metres, of an ankle above the floor
@@ -86,8 +99,7 @@ def sitting_clips(data: Path, quick: bool = False) -> dict[str, list[Clip]]:
     Args:
         data: folder with the sets. quick: one person, one height and few frames.
     """
-    persons = [_sitter(data, person, arms, _QUICK_FRAMES if quick else _FRAMES)
-               for person, arms in list(_PERSONS.items())[: 1 if quick else None]]  # fmt: skip
+    persons = read_sitters(data, SCORED_SITTERS, _QUICK_FRAMES if quick else _FRAMES, quick)
     heights = _HEIGHTS[:1] if quick else _HEIGHTS
     return {
         view: [_seen(one, azimuth, height) for one in persons for height in heights]
@@ -95,7 +107,7 @@ def sitting_clips(data: Path, quick: bool = False) -> dict[str, list[Clip]]:
     }
 
 
-class _Sitter(NamedTuple):
+class Sitter(NamedTuple):
     """A person who sits: name, joints [T, 15, 3] from the floor, up and left [3], frame rate."""
 
     name: str
@@ -105,7 +117,20 @@ class _Sitter(NamedTuple):
     fps: float
 
 
-def _sitter(data: Path, person: str, arms: str, frames: int) -> _Sitter:
+def read_sitters(
+    data: Path, persons: Mapping[str, str], frames: int, quick: bool = False
+) -> list[Sitter]:
+    """Return people who sit.
+
+    Args:
+        data: folder with the sets. persons: the recordings of their arms, by person. frames: of each.
+        quick: the first one alone.
+    """
+    chosen = list(persons.items())[: 1 if quick else None]
+    return [_sitter(data, person, arms, frames) for person, arms in chosen]
+
+
+def _sitter(data: Path, person: str, arms: str, frames: int) -> Sitter:
     (sits,), (moves,) = (
         [*recorded(data / MHAD, [f"{person}_{action}_r1"])] for action in ("a10_sit_down", arms)
     )
@@ -116,7 +141,7 @@ def _sitter(data: Path, person: str, arms: str, frames: int) -> _Sitter:
     bodies = with_arms(held, _to_and_fro(moves.joints.double(), frames))
     floor = (bodies[:, _ANKLES] @ up).min() - _SOLE
     middle = bodies[:, _PELVIS].mean(0)
-    return _Sitter(
+    return Sitter(
         person,
         bodies - middle + ((middle @ up) - floor) * up,
         up,
@@ -131,7 +156,7 @@ def _to_and_fro(joints: Float[Tensor, "N 15 3"], frames: int) -> Float[Tensor, "
     return both[torch.arange(frames) % len(both)]
 
 
-def _seen(one: _Sitter, azimuth: float, height: float) -> Clip:
+def _seen(one: Sitter, azimuth: float, height: float) -> Clip:
     """Return a person as a camera of a height sees it, from so many degrees to the left of its front."""
     angle = math.radians(azimuth)
     ahead = torch.linalg.cross(one.left, one.up)

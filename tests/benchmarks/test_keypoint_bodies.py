@@ -228,6 +228,17 @@ def test_quick_run_prints_people_who_lie(run_here):
         assert f"| kalman *, {row} |" in printed
 
 
+def test_quick_run_prints_people_behind_a_desk(run_here):
+    data = data_dir_or_skip(MHAD).parent
+    for name in (WALKS, ACTIONS):
+        data_dir_or_skip(name)
+    options = ("--data", str(data), "--quick", "--desk", "--methods", "kalman", "pose2sim")
+    printed = run_here("keypoint_bodies.__main__", *options)
+    for row in ("kalman", "mean pose", "still"):
+        assert f"| {row}, {WALKS} |" in printed and f"| {row}, all |" in printed
+    assert "pose2sim" not in printed  # knows nothing of joints that no camera sees
+
+
 def test_turned_rings_see_the_same_body_from_other_sides(walker):
     ahead, beside = (see(walker, faults=CLEAN, turn=turn) for turn in (0.0, 90.0))
     first, second = (clip.rig.rotation[0, 2] for clip in (ahead, beside))
