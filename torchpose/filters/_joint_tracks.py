@@ -6,7 +6,9 @@ a step is two products of that width, the rows of the measured dimensions, and o
 A <- [F, 0; 0, 1] A [F, 0; 0, 1]^T + [N, b; b^T, 0],   W = L^-1 [H P, H x - z],   A <- A - W^T W,
 
 with L L^T = H P H^T + R; the last column of W is minus the whitened innovation, and c loses the square
-of that. The measured dimensions come first, so that H P is a slice.
+of that. The measured dimensions come first, so that H P is a slice. W comes from eliminating the columns of
+S = L L^T in [H P, H x - z, S], one measured dimension of all tracks at a time: a factorisation and a solve
+of each small matrix take twice as long for some hundred tracks.
 """
 
 import itertools
@@ -34,7 +36,7 @@ from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
 _TRACK_NUMBERS = 1 << 17  # in the tracks that are stepped at a time: 1 MB, which stay in the cache
-_ON_DEVICE = 1 << 18  # where small operations wait for each other
+_SHARED_NUMBERS = 1 << 18  # where one product serves all, or where small operations wait
 _LOGS = 16  # standard deviations whose product is within range, and costs one logarithm
 
 
@@ -49,8 +51,8 @@ class JointProblem(NamedTuple):
     """Holds what is measured in one frame by B elements.
 
     Attributes:
-        z: [B, 1, Z], 0 where missing. noise, both: of `FrameNoise` [B, 1, Z, Z]; noise that all elements
-            share is [1, 1, Z, Z]. mask: [B, 1, Z, 1]. log_norm: constant of the likelihood [B, 1].
+        z: [Z, B, 1], 0 where missing. noise, both: of `FrameNoise` [Z, B, 1, Z]; noise that all elements
+            share is [Z, 1, 1, Z]. mask: [Z, B, 1, 1]. log_norm: constant of the likelihood [B, 1].
     """
 
     z: Tensor
@@ -64,11 +66,13 @@ def joint_chunks(model: MixtureKalmanFilter, batch: int, numbers: int = 0) -> li
     """Return equal shares of a batch, of which the tracks stay in the cache.
 
     Args:
-        numbers: of an element, beside those of its tracks.
+        numbers: of an element, beside those of its tracks, which one product makes for all elements of a
+            share; shares are then twice as large, since what it multiplies has to be read for each.
     """
     width = model.dim + spare_columns(model.dim)
     each = max(model.n_tracks * width**2, numbers)
-    most = _TRACK_NUMBERS if model.observed.device.type == "cpu" else _ON_DEVICE
+    shared = numbers > 0 or model.observed.device.type != "cpu"
+    most = _SHARED_NUMBERS if shared else _TRACK_NUMBERS
     count = max(1, min(batch, round(batch * each / most)))
     edges = [round(batch * i / count) for i in range(count + 1)]
     return [slice(*pair) for pair in itertools.pairwise(edges)]
@@ -113,10 +117,15 @@ def joint_problems(frames: Measurements) -> list[JointProblem]:
     if frames.cov.ndim == 2 and both is None:
         noise = noise[:1]
     n_frames = frames.z.shape[1]
-    gaps = [None] * n_frames if both is None else both[:, :, None].unbind(1)
-    parts = frames.z[:, :, None].to(noise), noise[:, :, None], mask[:, :, None, :, None], log_norm
-    rows = zip(*(part.unbind(1) for part in parts), gaps, strict=True)
-    return [JointProblem(z, r, gap, seen, norm) for z, r, seen, norm, gap in rows]
+    gaps = [None] * n_frames if both is None else _of_rows(both)
+    z, seen = frames.z.to(noise).movedim(2, 0)[..., None].unbind(2), _of_rows(mask[..., None])
+    rows = zip(z, _of_rows(noise), gaps, seen, log_norm.unbind(1), strict=True)
+    return [JointProblem(*row) for row in rows]
+
+
+def _of_rows(values: Float[Tensor, "B T Z N"]) -> tuple[Float[Tensor, "Z B 1 N"], ...]:
+    """Return the values of each frame, those of one measured dimension together."""
+    return values.movedim(2, 0)[..., None, :].unbind(2)
 
 
 class _Room:
@@ -126,13 +135,14 @@ class _Room:
         state: the tracks [B, M, E, E]. dim: D. n_observed: Z.
 
     Attributes:
-        flat: one after the other [B M, E, E]. rows, block: H P and H P H^T, beside H x.
+        flat: one after the other [B M, E, E]. rows, block: [H P, H x] [Z, B, M, E], H P H^T [Z, B, M, Z].
         mean: [B, M, D]. cov: [B, M, D, D]. corner: c [B, M].
     """
 
     def __init__(self, state: Tensor, dim: int, n_observed: int) -> None:
         self.state, self.flat = state, state.flatten(0, 1)
-        self.rows, self.block = state[..., :n_observed, :], state[..., :n_observed, :n_observed]
+        self.rows = state[..., :n_observed, :].movedim(2, 0)
+        self.block = self.rows[..., :n_observed]
         self.mean, self.corner = state[..., :dim, dim], state[..., dim, dim]
         self.cov = state[..., :dim, :dim]
 
@@ -168,9 +178,23 @@ class JointTracks:
         sizes = self.dim, self.n_observed
         self._now, self._other = _Room(state, *sizes), _Room(torch.empty_like(state), *sizes)
         self._matrix = torch.empty_like(self._now.flat)
-        self._measured = state.new_empty(self._now.rows.shape)
-        self._innovation = self._measured[..., self.dim]
+        self._make_work(state)
         self._first = state.shape[1] * torch.arange(len(state), device=state.device)[:, None]
+
+    def _make_work(self, state: Tensor) -> None:
+        """Allocate memory for [H P, H x - z, S], and take the views of every column of S."""
+        (batch, n_tracks, width), n_obs = state.shape[:3], self.n_observed
+        work = state.new_zeros(n_obs, batch, n_tracks, width + n_obs)
+        self._measured, self._block = work.split([width, n_obs], -1)
+        self._innovation = self._measured[..., self.dim]
+        self._white = self._measured.flatten(1, 2).transpose(0, 1)
+        self._turned = self._white.mT
+        self._pivots = self._block.diagonal(dim1=0, dim2=3).movedim(-1, 0)[..., None]
+        self._columns = []
+        for c in range(n_obs - 1):
+            column = self._block[c:, ..., c : c + 1]
+            share = torch.empty_like(column[1:])
+            self._columns.append((column[1:], column[:1], share, work[c + 1 :], work[c]))
 
     @property
     def state(self) -> Float[Tensor, "B M E E"]:
@@ -219,33 +243,51 @@ class JointTracks:
     ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M"] | None]:
         """Update the tracks as `correct` does, and return their log-likelihood and the jitter."""
         self._now.corner.zero_()  # which loses the squared innovation
-        factor, jitter = self._correct(problem)
-        log_norm = problem.log_norm - _half_log_det(factor)
+        scale, jitter = self._correct(problem)
+        log_norm = problem.log_norm + _log_product(scale[..., 0])
         return torch.add(log_norm, self._now.corner, alpha=0.5), jitter
 
     def _correct(
         self, problem: JointProblem
-    ) -> tuple[Float[Tensor, "B M Z Z"], Float[Tensor, "B M"] | None]:
-        """Update the tracks, and return the factor of their S and its jitter."""
-        now, measured = self._now, self._measured
-        if problem.both is None:
-            covariance = now.block + problem.noise
-            measured.copy_(now.rows)
+    ) -> tuple[Float[Tensor, "Z B M 1"], Float[Tensor, "B M"] | None]:
+        """Update the tracks, and return the inverse of the diagonal of L and the jitter of S."""
+        self._innovate(problem)
+        for below, pivot, share, rest, row in self._columns:
+            torch.div(below, pivot, out=share)
+            rest.addcmul_(share, row, value=-1)
+        if self._pivots.amin().item() > 0:  # none is NaN
+            scale, jitter = self._pivots.rsqrt(), None
+            self._measured.mul_(scale)
         else:
-            covariance = torch.addcmul(problem.noise, problem.both, now.block)
-            torch.mul(now.rows, problem.mask, out=measured)
+            scale, jitter = self._mend(problem)
+        self._now.flat.baddbmm_(self._turned, self._white, alpha=-1)
+        return scale, jitter
+
+    def _innovate(self, problem: JointProblem) -> None:
+        """Put [H P, H x - z, S] into memory."""
+        now = self._now
+        if problem.both is None:
+            self._measured.copy_(now.rows)
+            torch.add(now.block, problem.noise, out=self._block)
+        else:
+            torch.mul(now.rows, problem.mask, out=self._measured)
+            torch.addcmul(problem.noise, problem.both, now.block, out=self._block)
         self._innovation.sub_(problem.z)
-        factor, jitter = mended_cholesky(covariance)
-        torch.linalg.solve_triangular(factor, measured, upper=False, out=measured)
-        white = measured.flatten(0, 1)
-        now.flat.baddbmm_(white.mT, white, alpha=-1)
-        return factor, jitter
+
+    def _mend(
+        self, problem: JointProblem
+    ) -> tuple[Float[Tensor, "Z B M 1"], Float[Tensor, "B M"] | None]:
+        """Whiten [H P, H x - z] where S of some tracks is not positive definite, as `_correct` returns it."""
+        self._innovate(problem)
+        factor, jitter = mended_cholesky(self._block.movedim(0, 2))
+        measured = self._measured.movedim(0, 2)
+        measured.copy_(torch.linalg.solve_triangular(factor, measured, upper=False))
+        return factor.diagonal(dim1=-2, dim2=-1).movedim(-1, 0)[..., None].reciprocal(), jitter
 
 
-def _half_log_det(factor: Float[Tensor, "*batch Z Z"]) -> Float[Tensor, "*batch"]:
-    """Return log det L; of few factors by one logarithm, whose product is within range."""
-    pivots = factor.diagonal(dim1=-2, dim2=-1)
-    return pivots.prod(-1).log() if pivots.shape[-1] <= _LOGS else pivots.log().sum(-1)
+def _log_product(scale: Float[Tensor, "Z *batch"]) -> Float[Tensor, "*batch"]:
+    """Return the logarithm of a product, of few factors by one logarithm, whose product is within range."""
+    return scale.prod(0).log() if len(scale) <= _LOGS else scale.log().sum(0)
 
 
 def joint_estimate(

@@ -8,9 +8,12 @@ track: with r_z the rows of H F_j,
 one product of the symmetric parts of all P with g, which is made once. The small blocks are eliminated
 column by column, S = L diag(s) L^T, each step over all candidates at once; with u = L^-1 (z - H x),
 
-log N(z | i, j) = -1/2 sum_z (u_z^2 / s_z + log s_z + log 2 pi).
+log N(z | i, j) = -1/2 (sum_z u_z^2 / s_z + log prod_z s_z + Z log 2 pi),
+
+one logarithm for each candidate, where the product is within range.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,6 +24,8 @@ from torch import Tensor
 from torchpose._core.module_state import derived
 from torchpose.filters._joint_tracks import JointProblem, JointTracks, joint_model
 from torchpose.filters._mkf import MixtureKalmanFilter
+
+_FEW_TRACKS = 48  # with which products are faster as rows than as columns
 
 
 class SharedCandidates(NamedTuple):
@@ -89,16 +94,16 @@ def candidates(model: MixtureKalmanFilter, time: int) -> SharedCandidates:
 
 def candidate_problems(problems: Sequence[JointProblem]) -> list[CandidateProblem]:
     """Return what is measured in every frame, for `CandidateRoom.log_likelihood`."""
-    rows = _pairs(problems[0].z.shape[-1], problems[0].z.device)
+    rows = _pairs(len(problems[0].z), problems[0].z.device)
 
     def of_pairs(values: list[Tensor]) -> tuple[Tensor, ...]:
-        return _of_elements(torch.stack(values)[:, :, 0, *rows])
+        return _of_elements(torch.stack(values)[:, :, :, 0].transpose(1, 2)[..., *rows])
 
     noise = of_pairs([problem.noise for problem in problems])
     gaps = [problem.both for problem in problems if problem.both is not None]
     both = of_pairs(gaps) if gaps else [None] * len(problems)
-    z = _of_elements(torch.stack([problem.z for problem in problems])[:, :, 0])
-    mask = _of_elements(torch.stack([problem.mask for problem in problems])[:, :, 0, :, 0])
+    z = _of_elements(torch.stack([problem.z for problem in problems])[..., 0].mT)
+    mask = _of_elements(torch.stack([problem.mask for problem in problems])[..., 0, 0].mT)
     norms = [problem.log_norm for problem in problems]
     return [*map(CandidateProblem, z, noise, both, mask, norms)]
 
@@ -132,6 +137,7 @@ class CandidateRoom:
             for like in (shared.noise, shared.offset)
         )
         self._pivots = self._block[:n_obs]
+        self._least = torch.finfo(state.dtype).tiny ** (1 / n_obs)
         share = torch.empty_like(self._pivots[1:])
         columns = self._block[n_obs:].split([*range(n_obs - 1, 0, -1)])
         # Of each column of S below its pivot, what it is divided by, and what it takes from the rest.
@@ -147,8 +153,8 @@ class CandidateRoom:
 
     def log_likelihood(
         self, shared: SharedCandidates, tracks: JointTracks, problem: CandidateProblem
-    ) -> Float[Tensor, "K B M"]:
-        """Return log N(z | track continued by component), NaN where a block is not positive definite.
+    ) -> Float[Tensor, "K B M"] | None:
+        """Return log N(z | track continued by component), None if a block is not positive definite.
 
         Args:
             shared: of the frame. tracks: before the prediction. problem: what is measured.
@@ -162,20 +168,38 @@ class CandidateRoom:
             torch.div(below, pivot, out=share)
             for left, column, row in rest:
                 left.addcmul_(column, row, value=-1)
-        terms = self._residual.square_().div_(self._pivots).add_(self._pivots.log_())
-        return torch.add(problem.log_norm, terms.sum(0), alpha=-0.5)
+        log_det = self._log_det()
+        if log_det is None:
+            return None
+        squares = self._residual.square_().div_(self._pivots).sum(0)
+        return torch.add(problem.log_norm, squares.add_(log_det), alpha=-0.5)
+
+    def _log_det(self) -> Float[Tensor, "K B M"] | None:
+        """Return log det S, by one logarithm where every product of pivots is within range.
+
+        None if a pivot is not positive, not finite or NaN.
+        """
+        least, largest = (float(bound) for bound in self._pivots.aminmax())
+        if least > self._least and largest < 1 / self._least:
+            return self._pivots.prod(0).log_()
+        return self._pivots.log().sum(0) if least > 0 and largest < math.inf else None
 
     def _innovate(
         self, shared: SharedCandidates, tracks: JointTracks, problem: CandidateProblem
     ) -> None:
         """Form the measured blocks of S of all candidates, and the innovations."""
         pairs = shared.quadratic.shape[1]
-        packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed)).T
+        packed = tracks.state.view(-1).index_select(0, self._places).view(-1, len(shared.packed))
         noise, target = shared.noise, shared.offset
         if problem.both is None:
             noise, target = noise + problem.noise, target + problem.z
-        _add_product(self._block, noise, shared.quadratic, packed[:pairs])
-        _add_product(self._residual, target, shared.rows, packed[pairs:])
+        covs, means = packed[:, :pairs], packed[:, pairs:]
+        if len(packed) <= _FEW_TRACKS:
+            product = covs @ shared.quadratic.T
+            torch.add(noise, product.T.view(self._block.shape), out=self._block)
+        else:
+            _add_product(self._block, noise, shared.quadratic, covs.T)
+        _add_product(self._residual, target, shared.rows, means.T)
         if problem.both is not None:
             self._block.mul_(problem.both).add_(problem.noise)
             self._residual.add_(problem.z).mul_(problem.mask)

@@ -1,6 +1,5 @@
 """Run the mixture Kalman filter with split tracks (Smith & Winter, as cited in paper section 3.4)."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -195,7 +194,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         """Step the tracks in place, and return their log-weights and the estimate."""
         log_likelihood = room.log_likelihood(frame.shared, tracks, frame.own)
         jitter = None
-        if math.isfinite(log_likelihood.sum()):
+        if log_likelihood is not None:
             log_joint = (log_weights[..., None] + self.log_prior) + log_likelihood.permute(1, 2, 0)
         else:  # a block is to be mended, or lost
             group = torch.arange(len(log_weights), device=log_weights.device)
@@ -217,12 +216,13 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         are taken, not those that rounding prefers.
         """
         flat = log_joint.flatten(1)
-        log_evidence = torch.logsumexp(flat, -1)
+        shares = flat.log_softmax(1)
         # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
         spare = max(0, self.n_tracks - flat.shape[1])
-        padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf) if spare else flat
-        chosen = _first_of_largest(padded, self.n_tracks)
-        log_weights = padded.gather(1, chosen).log_softmax(-1).to(self.dtype)
+        padded = torch.nn.functional.pad(shares, (0, spare), value=-torch.inf) if spare else shares
+        largest, chosen = _first_of_largest(padded, self.n_tracks)
+        log_evidence = (flat.gather(1, chosen[:, :1]) - largest[:, :1])[:, 0]
+        log_weights = largest.log_softmax(-1).to(self.dtype)
         if spare:
             chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
         n_components = self.means.shape[0]
@@ -269,11 +269,15 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         return mean, cov, gain.jitter
 
 
-def _first_of_largest(log_weights: Float[Tensor, "B N"], count: int) -> Int[Tensor, "B n"]:
-    """Return the places of the largest log-weights in falling order, of equal ones the first places."""
+def _first_of_largest(
+    log_weights: Float[Tensor, "B N"], count: int
+) -> tuple[Float[Tensor, "B n"], Int[Tensor, "B n"]]:
+    """Return the largest log-weights in falling order and their places, of equal ones the first places."""
     if values_visible():
         largest, places = log_weights.topk(min(count + 1, log_weights.shape[1]), 1)
-        if bool((largest[:, :-1] - largest[:, 1:] > 2 / _RANKS).all()):  # ranks differ, none is NaN
-            return places[:, :count]
+        gaps = largest[:, :-1] - largest[:, 1:]
+        if gaps.numel() == 0 or gaps.amin().item() > 2 / _RANKS:  # ranks differ, none is NaN
+            return largest[:, :count], places[:, :count]
     ranks = (log_weights * _RANKS).round()
-    return ranks.sort(dim=1, descending=True, stable=True).indices[:, :count]
+    places = ranks.sort(dim=1, descending=True, stable=True).indices[:, :count]
+    return log_weights.gather(1, places), places
