@@ -34,6 +34,7 @@ from torchpose.video._person_stream import (
 )
 
 LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
+_WRITTEN = 32  # poses that are written together: opening the files takes longer than writing a pose
 
 
 class PoseSpool:
@@ -57,7 +58,8 @@ class PoseSpool:
             ) from error
         weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._like: PoseTrack | None = None
-        self._n_frames = 0
+        self._waiting: list[PoseTrack] = []
+        self._n_frames = self._n_written = 0
         self._exchanged = 0
         self._notes: tuple[str, ...] = ()
         self.failed_at = -1
@@ -73,27 +75,35 @@ class PoseSpool:
         """
         if len(block) != 1:
             raise InputError(f"a spool holds one sequence, got a block of {len(block)}")
-        try:
-            for name in FRAME_FIELDS:
-                with self._path(name).open("ab") as file:
-                    file.write(_array(getattr(block, name)).tobytes())
-        except OSError as error:
-            raise OutputError(
-                f"{self._folder}: poses cannot be kept here ({error.strerror or error})"
-            ) from error
         if self.failed_at < 0 <= int(block.failed_at[0]):
             self.failed_at = self._n_frames + int(block.failed_at[0])
         self._exchanged += exchanged_frames(block.notes)
         self._notes = joined_notes((*self._notes, *without_outliers(block.notes)))
         self._like = block if self._like is None else self._like
         self._n_frames += block.joints3d.shape[1]
+        self._waiting.append(block)
+        if self._n_frames - self._n_written >= _WRITTEN:
+            self._write()
+
+    def _write(self) -> None:
+        """Write the frames that wait for it."""
+        try:
+            for name in FRAME_FIELDS:
+                with self._path(name).open("ab") as file:
+                    file.writelines(_array(getattr(block, name)).data for block in self._waiting)
+        except OSError as error:
+            raise OutputError(
+                f"{self._folder}: poses cannot be kept here ({error.strerror or error})"
+            ) from error
+        self._waiting, self._n_written = [], self._n_frames
 
     def track(self, n_frames: int | None = None) -> PoseTrack:
         """Return the poses so far, or the first of them, read from the files as they are used.
 
         Raises:
-            InputError: there are none.
+            InputError: there are none. OutputError: the disk is full.
         """
+        self._write()
         like, count = self._like, self._n_frames if n_frames is None else n_frames
         if like is None or not 0 < count <= self._n_frames:
             raise InputError(f"expected 1 to {self._n_frames} poses, got {count}")
