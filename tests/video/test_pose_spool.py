@@ -58,6 +58,19 @@ def test_blocks_come_back_as_one_track_that_can_be_cut_saved_and_outlives_the_sp
     assert torch.equal(PoseTrack.load(tmp_path / "poses.npz").joints3d, track.joints3d)
 
 
+def test_single_poses_are_written_together_and_read_at_any_time(tmp_path):
+    frames, spool, sizes = [poses(1, seed) for seed in range(40)], PoseSpool(tmp_path), []
+    for frame in frames:
+        spool.append(frame)
+        sizes.append(sum(file.stat().st_size for file in tmp_path.glob("*/*.bin")))
+    assert sizes[30] == 0 and 0 < sizes[31] == sizes[39]
+    for count in (40, 41):
+        whole = torch.cat([frame.joints3d for frame in frames], 1)
+        assert torch.equal(spool.track().joints3d, whole)
+        frames.append(poses(1, count))
+        spool.append(frames[-1])
+
+
 def test_the_first_failure_is_known():
     spool = PoseSpool()
     for block in (poses(4), poses(4, failed_at=2), poses(4, failed_at=0)):
