@@ -13,9 +13,8 @@ if TYPE_CHECKING:
 
     from torchpose.camera._pinhole import PinholeCamera
 
-UNCALIBRATED = "uncalibrated"
+_UNCALIBRATED = "uncalibrated"
 _NAME = "camera"
-_HALF_TURN = (math.pi, 0.0, 0.0)  # y of a level camera points down, that of the world up
 _AXES = (
     "the camera has no pose: the axes of the world are its own, x right, y up, z towards the viewer, "
     "with the origin in the lens; it is taken to be about level"
@@ -24,7 +23,7 @@ _AXES = (
 
 def needs_no_file(cameras: str) -> bool:
     """Return whether text in place of a camera file stands for one camera, by its numbers or unknown."""
-    return not Path(cameras).exists() and (cameras == UNCALIBRATED or "," in cameras)
+    return not Path(cameras).exists() and (cameras == _UNCALIBRATED or "," in cameras)
 
 
 def camera_without_file(
@@ -49,25 +48,16 @@ def camera_without_file(
             "their poses in the room"
         )
     size, matrix = _images_of(inputs[0], videos)
-    given = None if text == UNCALIBRATED else text
+    given = None if text == _UNCALIBRATED else text
     if given is None and size is None and matrix is None:
         raise CameraError(
             f"{inputs[0]} does not tell the size of its images, so no focal length can be guessed: give the "
             "video by --videos, fx,fy,cx,cy in place of 'uncalibrated', or a TOML file with the camera"
         )
     camera, notes = resolve_camera(given, None, size, matrix, inputs[0])
-    return _upright(camera), (*notes, _AXES)
-
-
-def _upright(camera: "PinholeCamera") -> "PinholeCamera":
-    """Return a camera with a name, in a world whose y axis points up."""
-    from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.camera._projection import intrinsics
-
-    fx, fy, skew, cx, cy = map(float, intrinsics(camera.matrix))
-    return PinholeCamera(
-        fx, fy, cx, cy, camera.width, camera.height, _NAME, skew=skew, rotation=_HALF_TURN
-    )
+    camera.name = _NAME
+    camera.rotation[0] = math.pi  # y of a level camera points down, that of the world up
+    return camera, (*notes, _AXES)
 
 
 def _images_of(
