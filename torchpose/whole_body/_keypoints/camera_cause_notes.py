@@ -8,7 +8,7 @@ by a turn of the other.
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera._lens import distort_rays
@@ -93,31 +93,45 @@ def find_cause(rig: CameraRig, frames: KeypointFrame) -> CameraCause | None:
     tell = bool(given.promise.max() > _PROMISE * count)
     if not tell and not (n == 2 and cost > _WORST_OF_TWO):
         return None
-    cameras = given.promise.topk(min(n, _MOST_CAMERAS)).indices
-    before = _distance(given, 0, some)
-    if n == 2:
-        return _cause_of_two(rig, some, cameras, cost, count, before)
-    return _cause_of_several(rig, some, cameras, cost, count, before)
+    cameras = given.promise.topk(min(n, _MOST_CAMERAS)).indices.tolist()
+    seen = _Seen(rig, some, cameras, count, cost, _distance(given, 0, some))
+    return _cause_of_two(seen) if n == 2 else _cause_of_several(seen)
 
 
-def _cause_of_two(
-    rig: CameraRig,
-    some: KeypointFrame,
-    cameras: Int[Tensor, " N"],
-    cost: float,
-    count: float,
-    before: float,
-) -> CameraCause | None:
+class _Seen(NamedTuple):
+    """Holds what cameras see, and how well they agree as they are given.
+
+    Attributes:
+        rig, frames: the cameras and some frames. cameras: of which errors are tried.
+        n_keypoints: how many. cost: of one of them. distance: see `CameraCause.given`.
+    """
+
+    rig: CameraRig
+    frames: KeypointFrame
+    cameras: list[int]
+    n_keypoints: float
+    cost: float
+    distance: float
+
+    def costs(self, found: Explained) -> Float[Tensor, " N"]:
+        """Return the cost of a keypoint by explanations."""
+        return found.cost / self.n_keypoints
+
+
+def _cause_of_two(seen: _Seen) -> CameraCause | None:
     """Return the turn of one camera that explains what both see, or nothing."""
-    causes = [(c, _TURN) for c in cameras.tolist()]
-    found = explain(rig, _repeated(some, len(causes)), Causes.of(causes, _device(some)))
+    causes = [(c, _TURN) for c in seen.cameras]
+    some = seen.frames
+    found = explain(seen.rig, _repeated(some, len(causes)), Causes.of(causes, _device(some)))
     best = int(found.cost.argmin())
-    left = float(found.cost[best]) / count
+    left = float(seen.costs(found)[best])
     camera = causes[best][0]
-    if cost - left > _OF_TWO and left < _WORST_OF_TWO:
+    if seen.cost - left > _OF_TWO and left < _WORST_OF_TWO:
         degrees = float(torch.rad2deg(found.errors[best, :TURN].norm()))
-        return CameraCause("turn", camera, degrees, before, _distance(found, best, some))
-    return CameraCause("nothing", camera, 0.0, before, before) if left > _WORST_OF_TWO else None
+        return CameraCause("turn", camera, degrees, seen.distance, _distance(found, best, some))
+    if left > _WORST_OF_TWO:
+        return CameraCause("nothing", camera, 0.0, seen.distance, seen.distance)
+    return None
 
 
 class _Tried(NamedTuple):
@@ -128,24 +142,18 @@ class _Tried(NamedTuple):
     free: tuple[int, ...]
 
 
-def _cause_of_several(
-    rig: CameraRig,
-    some: KeypointFrame,
-    cameras: Int[Tensor, " N"],
-    cost: float,
-    count: float,
-    before: float,
-) -> CameraCause | None:
+def _cause_of_several(seen: _Seen) -> CameraCause | None:
     """Return the focal length or the lens that explains what cameras see better than any pose does."""
+    rig, some = seen.rig, seen.frames
     kinds = {"pose": _POSE, "focal": (FOCAL,), "lens": (LENS,)}
-    tried = [_Tried(kind, c, free) for c in cameras.tolist() for kind, free in kinds.items()]
-    raw = [_Tried("raw", c, ()) for c in cameras.tolist() if bool(rig.distortions[c].any())]
+    tried = [_Tried(kind, c, free) for c in seen.cameras for kind, free in kinds.items()]
+    raw = [_Tried("raw", c, ()) for c in seen.cameras if bool(rig.distortions[c].any())]
     own = _repeated(some, len(tried))
     distorted = [_distorted(rig, some, one.camera).map(lambda value: value[None]) for one in raw]
     frames = KeypointFrame(*(torch.cat(values) for values in zip(own, *distorted, strict=True)))
     tried += raw
     found = explain(rig, frames, Causes.of([one[1:] for one in tried], _device(some)))
-    gains = (cost - found.cost / count).tolist()
+    gains = (seen.cost - seen.costs(found)).tolist()
     # a lens that is given and not there says more than that it is undone by another one
     row = max(range(len(tried)), key=lambda i: gains[i] + _BEFORE_OTHERS * (tried[i].kind == "raw"))
     kind, camera, _ = tried[row]
@@ -156,7 +164,7 @@ def _cause_of_several(
     if kind == "focal" and abs(float(errors[FOCAL])) < _LEAST_FOCAL:
         return None
     value = float(errors[FOCAL].exp()) if kind == "focal" else float(errors[LENS])
-    return CameraCause(kind, camera, value, before, _distance(found, row, some))
+    return CameraCause(kind, camera, value, seen.distance, _distance(found, row, some))
 
 
 def _alike(one: _Tried, other: _Tried) -> bool:
