@@ -14,7 +14,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 from tqdm.auto import tqdm
 
 from benchmarks.keypoint_bodies.clips import (
@@ -33,6 +32,7 @@ from torchpose.body import BODY_15
 from torchpose.evaluation import Report
 from torchpose.evaluation._trials import settings_hash
 from torchpose.metrics import coverage
+from torchpose.whole_body._keypoints.upright import axes_of
 
 __all__ = ["add_desk_table", "desk_clips"]
 
@@ -141,10 +141,7 @@ def _axes(
     joints: Float[Tensor, "T 15 3"], up: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "T 1 3"], Float[Tensor, "T 3 3"]]:
     """Return the middle of the shoulders, and the directions to their left, up and ahead."""
-    across = joints[:, _SHOULDERS[0]] - joints[:, _SHOULDERS[1]]
-    left = normalize(across - (across @ up)[:, None] * up, dim=-1)
-    axes = torch.stack([left, up.expand_as(left), torch.linalg.cross(left, up.expand_as(left))], 1)
-    return joints[:, _SHOULDERS].mean(1, keepdim=True), axes
+    return joints[:, _SHOULDERS].mean(1, keepdim=True), axes_of(joints, up)
 
 
 def _measures(estimate: Estimate, clip: Clip) -> list[float]:

@@ -44,8 +44,7 @@ from torchpose.whole_body._keypoints.lifting_network import (
     shipped_lifting_network,
 )
 from torchpose.whole_body._keypoints.nested import mapped
-from torchpose.whole_body._keypoints.upright import LEGS as USUAL_LEGS
-from torchpose.whole_body._keypoints.upright import camera_up, upright_of
+from torchpose.whole_body._keypoints.upright import LEGS, camera_up, upright_of
 
 # On the network's standard deviations, which are those of persons that it was fitted to.
 _FACTOR = 1.5
@@ -59,8 +58,7 @@ _NEAREST = 0.5  # metres from the camera
 _LEAST_UP = 0.2  # share of the upward direction in the image plane, below which it tells no roll
 _PELVIS = BODY_15.joint("pelvis")
 _NECK = BODY_15.joint("neck")
-_LEGS = [j for j, name in enumerate(BODY_15.names) if name.endswith(("knee", "ankle"))]
-_HIDDEN = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip"), *_LEGS]
+_HIDDEN = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip"), *LEGS]
 _REMEMBERED = 1.0  # seconds for which legs are expected as they were seen
 _USUAL_SHARE = 10.0  # of the information about usual legs, afterwards, against that of the priors
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
@@ -255,7 +253,7 @@ def legs_guessed_by(lifted: Lifted, filter: BodyKalmanFilter, state: BodyGaussia
         lifted: [B, J], world axes. filter: whose states they are. state: [B].
     """
     std = torch.full_like(lifted.std, torch.inf)
-    std[..., _LEGS] = lifted.std[..., _LEGS] / math.sqrt(filter.transition.share)
+    std[..., LEGS] = lifted.std[..., LEGS] / math.sqrt(filter.transition.share)
     alone = torch.ones_like(std[..., :1])
     return corrected_by(Lifted(lifted.joints, std), filter, state, alone)
 
@@ -266,7 +264,7 @@ def shares_of_usual(unseen: Float[Tensor, "B J"]) -> Float[Tensor, "B 12"]:
     Args:
         unseen: seconds since joints were seen.
     """
-    long = (unseen[:, USUAL_LEGS] - _REMEMBERED).clamp(0.0, 1.0)
+    long = (unseen[:, LEGS] - _REMEMBERED).clamp(0.0, 1.0)
     return (_USUAL_SHARE * long).repeat_interleave(3, -1)
 
 

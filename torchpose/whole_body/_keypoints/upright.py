@@ -12,19 +12,15 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._body_files import UP_AXES
 
-# Of the upward direction in the axes of the pelvis, to the left and forward.
+# Of the upward direction in the axes of the pelvis, to the left and forward. Trunks, from the middle of the
+# hips to that of the shoulders, have the same deviations about no lean.
 _MEAN, _STD = (0.0, -0.1), (0.08, 0.08)
-# The same of the trunk, from the middle of the hips to that of the shoulders, in axes of the shoulders.
-_TRUNK_MEAN, _TRUNK_STD = (0.0, 0.0), (0.08, 0.08)
 _TILT = (0.1, 0.1)  # radians, of the roll and pitch of a camera
 _ROLL, _PITCH = 0.05, 0.3  # the same of several cameras: tripods are level, lenses point down
 _FREEDOM = 4.0  # degrees of freedom of a lean's t distribution, for people who bend
 
-
 _SHOULDERS = [BODY_15.joint("left_shoulder"), BODY_15.joint("right_shoulder")]
 _HIPS = [BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
-
-
 LEGS = [BODY_15.joint(f"{side}_{n}") for n in ("knee", "ankle") for side in ("left", "right")]
 """Joints of `Upright.legs`."""
 # From the middle of the hips to the left, up and ahead, in lengths of a leg. Means of positions, which are
@@ -66,34 +62,23 @@ class Upright(NamedTuple):
         gap = self.mean - torch.stack([x, z], -1)
         return Expected(gap, _variance_of(gap, self.variance), jacobian)
 
-    def axes_of(self, joints: Float[Tensor, "*batch J 3"]) -> Float[Tensor, "*batch 3 3"]:
-        """Return the directions to the left of the shoulders, up, and ahead, world axes."""
-        across = joints[..., _SHOULDERS[0], :] - joints[..., _SHOULDERS[1], :]
-        level = across - (across @ self.direction)[..., None] * self.direction
-        left = torch.nn.functional.normalize(level, dim=-1)
-        up = self.direction.expand_as(left)
-        return torch.stack([left, up, torch.linalg.cross(left, up)], -2)
-
     def trunk_lean(self, articulation: Articulation, point: BodyPoint) -> Expected:
         """Return how far trunks, from the middle of the hips to that of the shoulders, are from upright.
 
         The derivative is that of turns: lengths of trunks, and axes of shoulders, are taken as they are.
         """
         joints, moved = articulation.linearise(point)
-        axes = self.axes_of(joints)[..., [0, 2], :]
+        axes = axes_of(joints, self.direction)[..., [0, 2], :]
         trunk = (joints[..., _SHOULDERS, :] - joints[..., _HIPS, :]).mean(-2)
         length = trunk.norm(dim=-1)[..., None]
         turned = (moved[..., _SHOULDERS, :, :] - moved[..., _HIPS, :, :]).mean(-3)
-        mean = torch.tensor(_TRUNK_MEAN).to(length)
-        gap = mean - (axes @ trunk[..., None]).squeeze(-1) / length
-        std, own = (torch.tensor(v).to(length) for v in (_TRUNK_STD, _STD))
-        variance = self.variance - own.square() + std.square()
-        return Expected(gap, _variance_of(gap, variance), axes @ turned / length[..., None])
+        gap = -(axes @ trunk[..., None]).squeeze(-1) / length
+        return Expected(gap, _variance_of(gap, self.variance), axes @ turned / length[..., None])
 
     def legs(self, articulation: Articulation, point: BodyPoint) -> Expected:
         """Return how far knees and ankles are from where they are on average, [B, 12]; see `LEGS`."""
         joints, moved = articulation.linearise(point)
-        axes = self.axes_of(joints)
+        axes = axes_of(joints, self.direction)
         hips = joints[..., _HIPS, :].mean(-2, keepdim=True)
         below = (joints[..., LEGS, :] - hips) @ axes.mT
         turned = moved[..., LEGS, :, :] - moved[..., _HIPS, :, :].mean(-3, keepdim=True)
@@ -103,6 +88,16 @@ class Upright(NamedTuple):
         return Expected(
             (mean - below).flatten(-2), std.square().flatten(-2), jacobian.flatten(-3, -2)
         )
+
+
+def axes_of(
+    joints: Float[Tensor, "*batch J 3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return the directions to the left of the shoulders, up, and ahead, world axes."""
+    across = joints[..., _SHOULDERS[0], :] - joints[..., _SHOULDERS[1], :]
+    left = torch.nn.functional.normalize(across - (across @ up)[..., None] * up, dim=-1)
+    up = up.expand_as(left)
+    return torch.stack([left, up, torch.linalg.cross(left, up)], -2)
 
 
 def _variance_of(gap: Float[Tensor, "*batch 2"], variance: Tensor) -> Float[Tensor, "*batch 2"]:
