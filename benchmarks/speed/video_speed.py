@@ -92,10 +92,11 @@ def whole(report: Report, clip: Path, n_frames: int, setup: Setup, mediapipe: Pa
             for _ in source:
                 pass
 
-    recorder, camera = make_tracker(), make_tracker()
+    recorder, alone, camera = make_tracker(), make_tracker(), make_tracker()
     paper, parted = make_tracker(hands="mean-shift"), make_tracker(background=True)
     cases = [
-        Case("a recording", lambda: track(recorder), n_frames),
+        Case("a recording", lambda: track(recorder, workers=1), n_frames),
+        Case("a recording, without another process", lambda: track(alone), n_frames),
         Case(
             "frame by frame, as a camera is",
             lambda: track(camera, watch=lambda *_: None),

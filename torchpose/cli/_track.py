@@ -104,6 +104,7 @@ def run(
     video: dict[str, Any],
     face_model: str | None = None,
     method_options: dict[str, Any],
+    workers: int = 1,
     overlay: bool = True,
     pictures: bool = True,
     given: Given,
@@ -123,6 +124,7 @@ def run(
         method_options: the options of the method.
         face_model: video: find faces with a detector of MediaPipe (.tflite) in place of OpenCV's
             cascade; needs mediapipe.
+        workers: video: processes beside this one that look ahead in a long recording, 0 or 1.
         overlay: video: write overlay.mp4 and report.html.
         pictures: draw pose_strip.png and joint_curves.png.
         given: the command.
@@ -142,8 +144,10 @@ def run(
     if is_video(input):
         from torchpose.cli._track_video import track_video
 
-        return track_video(job, video, face_model, overlay)
-    given.refuse((*video, "face_model", "overlay"), f"videos, and {input} holds keypoints")
+        return track_video(job, video, face_model, overlay, workers)
+    given.refuse(
+        (*video, "face_model", "overlay", "workers"), f"videos, and {input} holds keypoints"
+    )
     return track_keypoints(job)
 
 

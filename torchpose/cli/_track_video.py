@@ -38,13 +38,18 @@ _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON 
 
 
 def track_video(
-    job: TrackingJob, options: dict[str, Any], face_model: str | None, overlay: bool
+    job: TrackingJob,
+    options: dict[str, Any],
+    face_model: str | None,
+    overlay: bool,
+    workers: int = 0,
 ) -> int:
     """Track everybody, write and report, and return the exit code: 1 if there is nobody.
 
     Args:
         job: of the command. options: of `VideoTracker`. face_model: file of a face detector, or None.
         overlay: whether the video and the page that show the poses are written.
+        workers: of `VideoTracker.forward`, for a recording.
     """
     from torchpose.camera._choice import resolve_camera
     from torchpose.priors._upper_body_prior import load_prior
@@ -64,7 +69,7 @@ def track_video(
             results = stack.enter_context(track_results(job.out, job.files, pictures, overlay))
             start = time.perf_counter()
             if source.reopenable:
-                people, n_read = _track_recording(tracker, source, results.stage)
+                people, n_read = _track_recording(tracker, source, results.stage, workers)
                 n_frames = n_read
             else:
                 people, n_read, n_frames = _track_camera(tracker, source, results.stage, overlay)
@@ -186,11 +191,13 @@ def _tracker(
 
 
 def _track_recording(
-    tracker: "VideoTracker", source: "VideoSource", out: Path
+    tracker: "VideoTracker", source: "VideoSource", out: Path, workers: int
 ) -> tuple[list["TrackedPerson"], int]:
     """Return everybody in a file or folder and how many frames it had; Ctrl-C ends the recording."""
     with UntilInterrupted(source) as frames:
-        people = tracker(frames, progress=show_progress(), n_frames=source.n_frames, folder=out)
+        people = tracker(
+            frames, show_progress(), n_frames=source.n_frames, folder=out, workers=workers
+        )
     if frames.interrupted:
         of = "" if source.n_frames is None else f" of {source.n_frames}"
         source.notes.append(

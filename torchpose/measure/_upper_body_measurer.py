@@ -102,13 +102,14 @@ class PersonsView(NamedTuple):
     """Holds what the image of a frame shows of N persons.
 
     Attributes:
-        after: the state for the next frame. faces: (x, y, size) [N, 3]. covariance: [N, 3, 3].
+        after: the state for the next frame; None where another process keeps it.
+        faces: (x, y, size) [N, 3]. covariance: [N, 3, 3].
         number: of each person. foreground: of the background model, if any.
         hands: what windows show; None for mean shift, and without persons.
         cut: whether the video cuts to another scene before this frame.
     """
 
-    after: SeenPersons
+    after: SeenPersons | None
     faces: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 3 3"]
     number: Int[Tensor, " N"]
@@ -283,7 +284,7 @@ class UpperBodyMeasurer(nn.Module):
         cov = torch.where(keypoints.isfinite().all(-1)[..., None, None], cov, eye)
         cov = rounded_covariance(cov)
         measured = FrameMeasurements(number, keypoints, cov, faces, hands, view.cut)
-        return MeasurerState(view.after, hand_state), measured
+        return MeasurerState(view.after or state.seen, hand_state), measured
 
     def _hands(
         self,

@@ -1,0 +1,194 @@
+"""Send values that hold tensors to another process, and receive them."""
+
+import io
+import mmap
+import os
+import pickle
+import struct
+import tempfile
+from typing import IO, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_HEADER = struct.Struct("<QQq")  # bytes of the pickle, of the arrays, and where these are in memory
+_IN_PIPE = -1  # in place of where they are
+_STEP = 64  # arrays begin at multiples of this many bytes
+_SHARES = 16  # what is larger than this part of the memory goes through the pipe
+WAITING = _SHARES - 2  # values that may be sent before they are received
+
+
+def shared_memory(size: int) -> int:
+    """Return the descriptor of memory that processes share, which ends with the last of them.
+
+    Raises:
+        OSError: there is not so much.
+    """
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("torchpose")
+        os.ftruncate(descriptor, size)
+        return descriptor
+    with tempfile.TemporaryFile() as file:
+        file.write(bytes(size))
+        file.flush()
+        return os.dup(file.fileno())
+
+
+class PipeWriter:
+    """Sends values to a `PipeReader`. What a value has in common with the one before is not sent again.
+
+    Tensors keep the order of their elements in memory, on which the last digits of sums depend. They must not
+    be written to once they were sent.
+
+    Args:
+        file: a pipe, open for writing.
+        memory: the descriptor of `shared_memory`, through which arrays go quicker; no more than `WAITING`
+            values may be sent before they are received.
+    """
+
+    def __init__(self, file: IO[bytes], memory: int) -> None:
+        self._file, self._ring = file, _Ring(memory)
+        self._before: dict[int, tuple[Tensor | np.ndarray, int]] = {}
+
+    def write(self, value: Any) -> None:
+        """Send a value; arrays and tensors may be inside of anything that can be pickled.
+
+        Raises:
+            OSError: nobody reads any more. Whatever `pickle` raises for what cannot be pickled.
+        """
+        message = _Message(self._before)
+        head = message.pickled(value)
+        self._before = message.sent
+        start = self._ring.place(message.size)
+        if start != _IN_PIPE:
+            self._ring.fill(start, message.parts)
+        self._file.write(_HEADER.pack(len(head), message.size, start))
+        self._file.write(head)
+        if start == _IN_PIPE:
+            block = np.empty(message.size, np.uint8)
+            _fill(block, message.parts)
+            self._file.write(block.data)
+        self._file.flush()
+
+
+class PipeReader:
+    """Receives the values of a `PipeWriter`.
+
+    Args:
+        file: the pipe, open for reading. memory: see `PipeWriter`.
+    """
+
+    def __init__(self, file: IO[bytes], memory: int) -> None:
+        self._file, self._ring = file, _Ring(memory)
+        self._before: dict[int, Any] = {}
+
+    def read(self) -> Any:
+        """Return the next value.
+
+        Raises:
+            EOFError: there is none.
+        """
+        length, size, start = _HEADER.unpack(self._exactly(_HEADER.size).data)
+        head = self._exactly(length)
+        block = self._exactly(size) if start == _IN_PIPE else self._ring.copy(start, size)
+        found: dict[int, Any] = {}
+
+        def array_at(place: tuple[Any, ...]) -> Any:
+            number, *where = place
+            if number not in found:
+                found[number] = self._before[where[0]] if len(where) == 1 else _array(block, *where)
+            return found[number]
+
+        unpickler = pickle.Unpickler(io.BytesIO(head.data))
+        unpickler.persistent_load = array_at  # type: ignore[method-assign]
+        value = unpickler.load()
+        self._before = found
+        return value
+
+    def _exactly(self, size: int) -> np.ndarray:
+        """Return so many bytes of the pipe."""
+        block = np.empty(size, np.uint8)
+        if self._file.readinto(block.data) < size:  # type: ignore[attr-defined]
+            raise EOFError("the pipe has ended")
+        return block
+
+
+class _Ring:
+    """Holds shared memory, of which every value takes the next part."""
+
+    def __init__(self, memory: int) -> None:
+        self._bytes = np.frombuffer(mmap.mmap(memory, 0), np.uint8)
+        self._end = 0
+
+    def place(self, size: int) -> int:
+        """Return the place of the next so many bytes, or that they are too many."""
+        if size > len(self._bytes) // _SHARES:
+            return _IN_PIPE
+        start = self._end if self._end + size <= len(self._bytes) else 0
+        self._end = start + size
+        return start
+
+    def fill(self, start: int, parts: list[tuple[np.ndarray, int]]) -> None:
+        """Write bytes to their places after `start`."""
+        _fill(self._bytes[start:], parts)
+
+    def copy(self, start: int, size: int) -> np.ndarray:
+        """Return bytes that stay."""
+        return self._bytes[start : start + size].copy()
+
+
+def _fill(block: np.ndarray, parts: list[tuple[np.ndarray, int]]) -> None:
+    for part, at in parts:
+        block[at : at + part.size] = part
+
+
+class _Message:
+    """Collects the arrays of a value while it is pickled.
+
+    Attributes:
+        sent: arrays and tensors of the value with their numbers, by identity.
+        parts: bytes, and the places where they are to be. size: of all.
+    """
+
+    def __init__(self, before: dict[int, tuple[Tensor | np.ndarray, int]]) -> None:
+        self._before = before
+        self.sent: dict[int, tuple[Tensor | np.ndarray, int]] = {}
+        self.parts: list[tuple[np.ndarray, int]] = []
+        self.size = 0
+
+    def pickled(self, value: Any) -> memoryview:
+        """Return the value without its arrays."""
+        file = io.BytesIO()
+        pickler = pickle.Pickler(file, 5)
+        pickler.persistent_id = self._place  # type: ignore[method-assign]
+        pickler.dump(value)
+        return file.getbuffer()
+
+    def _place(self, part: Any) -> tuple[Any, ...] | None:
+        """Return what stands for an array or tensor in the pickle; None for anything else."""
+        if type(part) is not Tensor and type(part) is not np.ndarray:
+            return None
+        if id(part) in self.sent:
+            return (self.sent[id(part)][1],)
+        number = len(self.sent)
+        self.sent[id(part)] = part, number
+        if id(part) in self._before:
+            return number, self._before[id(part)][1]
+        array = part if isinstance(part, np.ndarray) else part.detach().numpy()
+        order = sorted(range(array.ndim), key=array.strides.__getitem__, reverse=True)
+        ordered = array.transpose(order)
+        start = self.size
+        self.parts.append((np.ascontiguousarray(ordered).reshape(-1).view(np.uint8), start))
+        self.size += -(-array.nbytes // _STEP) * _STEP
+        return number, isinstance(part, Tensor), array.dtype.str, ordered.shape, order, start
+
+
+def _array(
+    block: np.ndarray, tensor: bool, kind: str, shape: tuple[int, ...], order: list[int], start: int
+) -> Tensor | np.ndarray:
+    """Return the array or tensor that starts at a byte of the block."""
+    dtype = np.dtype(kind)
+    end = start + dtype.itemsize * int(np.prod(shape))
+    array = block[start:end].view(dtype).reshape(shape).transpose(np.argsort(order))
+    return torch.from_numpy(array) if tensor else array
