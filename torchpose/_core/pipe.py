@@ -176,19 +176,28 @@ class _Message:
         if id(part) in self._before:
             return number, self._before[id(part)][1]
         array = part if isinstance(part, np.ndarray) else part.detach().numpy()
-        order = sorted(range(array.ndim), key=array.strides.__getitem__, reverse=True)
-        ordered = array.transpose(order)
-        start = self.size
-        self.parts.append((np.ascontiguousarray(ordered).reshape(-1).view(np.uint8), start))
-        self.size += -(-array.nbytes // _STEP) * _STEP
-        return number, isinstance(part, Tensor), array.dtype.str, ordered.shape, order, start
+        back: list[int] | None = None
+        if not array.flags.c_contiguous:
+            order = sorted(range(array.ndim), key=array.strides.__getitem__, reverse=True)
+            array = array.transpose(order)
+            back = sorted(range(array.ndim), key=order.__getitem__)
+        start, end = self.size, self.size + array.nbytes
+        self.parts.append((np.ascontiguousarray(array).reshape(-1).view(np.uint8), start))
+        self.size = -(-end // _STEP) * _STEP
+        return number, isinstance(part, Tensor), array.dtype, array.shape, back, start, end
 
 
 def _array(
-    block: np.ndarray, tensor: bool, kind: str, shape: tuple[int, ...], order: list[int], start: int
+    block: np.ndarray,
+    tensor: bool,
+    dtype: np.dtype,
+    shape: tuple[int, ...],
+    back: list[int] | None,
+    start: int,
+    end: int,
 ) -> Tensor | np.ndarray:
-    """Return the array or tensor that starts at a byte of the block."""
-    dtype = np.dtype(kind)
-    end = start + dtype.itemsize * int(np.prod(shape))
-    array = block[start:end].view(dtype).reshape(shape).transpose(np.argsort(order))
+    """Return the array or tensor between two bytes of the block, whose dimensions go back to their order."""
+    array = block[start:end].view(dtype).reshape(shape)
+    if back is not None:
+        array = array.transpose(back)
     return torch.from_numpy(array) if tensor else array
