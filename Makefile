@@ -76,6 +76,8 @@ install: $(VENV)/.installed-dev
 # unused ones hardly any is ever imported; Python compiles these then.
 UNUSED := tests?|_inductor|_vendor|aiohttp|fontTools|grpc|kornia|lightning_fabric|mypyc?|networkx
 UNUSED := $(UNUSED)|onnxruntime|pip|pygments|pytorch_lightning|setuptools|tensorboard|testing|torchgen
+UNUSED := $(UNUSED)|claw|distutils|elastic|ensemble|hipify|idna|implementations|parsing|physics|pipelining
+UNUSED := $(UNUSED)|pyprima|reference|requests|unidata|urllib3|watchdog|werkzeug
 $(VENV)/.installed-%: pyproject.toml constraints.txt
 	@set -e; \
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
