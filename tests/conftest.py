@@ -3,6 +3,7 @@
 TORCHPOSE_SHAPE_CHECKS=0 switches the shape checks off, for profiling or a debugger.
 """
 
+import contextlib
 import gc
 import os
 import signal
@@ -83,3 +84,34 @@ def prior(small_windows_file):
     from torchpose.priors import UpperBodyPrior
 
     return UpperBodyPrior.load(small_windows_file)
+
+
+@pytest.fixture(scope="module")
+def undoubted_cameras():
+    """In a module of tests nobody looks for what is wrong with cameras that see a body's keypoints.
+
+    That takes more than half of the time of a short track, and makes nothing but notes.
+    """
+    with _undoubted():
+        yield
+
+
+@pytest.fixture
+def undoubted_here():
+    """The same in one test."""
+    with _undoubted():
+        yield
+
+
+@contextlib.contextmanager
+def _undoubted():
+    from torchpose.whole_body._keypoints.track_builder import TrackBuilder
+
+    whole = TrackBuilder.track
+
+    def track(*given, **options):
+        return whole(*given, **options | {"cameras": False})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrackBuilder, "track", track)
+        yield

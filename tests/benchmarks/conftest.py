@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def run_here(monkeypatch, capsys):
+def run_here(monkeypatch, capsys, undoubted_cameras):
     """Run a script in this process, which keeps its cores: what it prints."""
 
     def run(script: str, *options: str) -> str:

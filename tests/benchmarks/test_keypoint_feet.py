@@ -15,6 +15,8 @@ from torchpose.body import BODY_15
 from torchpose.body._feet import ANKLES, FEET
 from torchpose.priors._foot_prior import FootPrior, shipped_foot_prior
 
+pytestmark = pytest.mark.usefixtures("undoubted_cameras")
+
 TOES = [FEET.index(f"{side}_big_toe") for side in ("left", "right")]
 
 

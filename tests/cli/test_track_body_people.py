@@ -23,6 +23,8 @@ from torchpose.io import read_keypoints, write_keypoints
 from torchpose.io._formats.openpose import read_openpose_people
 from torchpose.whole_body import BodyTrack
 
+pytestmark = pytest.mark.usefixtures("undoubted_cameras")
+
 BOTH = ("front_json", "left_json", "behind.npz")
 ENTERS = 2  # frame from which on the second person is there
 

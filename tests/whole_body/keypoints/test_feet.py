@@ -20,6 +20,8 @@ from torchpose.whole_body._body_feet import BodyFeet
 from torchpose.whole_body._keypoints.foot_filter import FootFilter
 from torchpose.whole_body._keypoints.foot_motion import N_FOOT, foot_motion
 
+pytestmark = pytest.mark.usefixtures("undoubted_cameras")
+
 WITH_FEET = (*NAMES, *FEET)
 ANKLE_OF = [ankle for ankle in ANKLES for _ in range(3)]
 

@@ -14,6 +14,8 @@ from torchpose.whole_body._keypoints.people_tracker import PeopleTracker
 from torchpose.whole_body._keypoints.people_turns import turns_of_all
 from torchpose.whole_body._keypoints.turned_cameras import angles_of
 
+pytestmark = pytest.mark.usefixtures("undoubted_cameras")
+
 T = 32
 
 

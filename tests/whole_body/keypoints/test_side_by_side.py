@@ -15,6 +15,8 @@ from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.lifted_pose import _of_expected_size, telling
 
+pytestmark = pytest.mark.usefixtures("undoubted_cameras")
+
 LEGS = [i for i, name in enumerate(NAMES) if name.endswith(("knee", "ankle"))]
 
 
