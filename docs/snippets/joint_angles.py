@@ -36,7 +36,7 @@ def angle_with_std(joints: Tensor, covs: Tensor, shared: float = 0.0) -> tuple[T
 
 
 camera = PinholeCamera(900, 900, 639.5, 359.5, 1280, 720, "cam", translation=(0, 0, 3))
-states = torch.zeros(60, 36, dtype=torch.float64)
+states = torch.zeros(20, 36, dtype=torch.float64)
 states[:, 3] = math.pi  # upright where y points down
 truth = Body.of_height(BODY_15, 1.75).joints(states)
 rig = CameraRig([camera])

@@ -20,7 +20,7 @@ class FrontEnd(nn.Module):
 prior = torchpose.load_prior("kinect-upper-body-small")
 tracker = torchpose.UpperBodyTracker(prior, camera=demo_camera(), method="window-mixture")
 tracker.requires_grad_(False)
-truth = performer(40, seed=0).joints
+truth = performer(20, seed=0).joints
 keypoints = noisy_keypoints(truth, std_px=3.0)[None]  # unbiased: no factor needs to change
 
 

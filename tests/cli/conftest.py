@@ -12,8 +12,8 @@ from torchpose.cli import main
 from torchpose.io import Keypoints, Recording, write_keypoints
 from torchpose.learning import fit_upper_body_prior
 
-N_FRAMES = 45
-GAP = slice(30, 35)
+N_FRAMES = 24
+GAP = slice(15, 18)
 
 
 @dataclass

@@ -31,14 +31,14 @@ def clip(tmp_path_factory):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty working folder with the keypoints of head, neck and hands, three seconds long."""
+    """An empty working folder with the keypoints of head, neck and hands, one second long."""
     from torchpose.io import Keypoints, write_keypoints
 
-    seconds = torch.arange(90, dtype=torch.float64) / 30
+    seconds = torch.arange(30, dtype=torch.float64) / 30
     still = torch.tensor([[320.0, 160.0], [320.0, 205.0], [400.0, 330.0], [240.0, 330.0]])
-    points = still.double().repeat(90, 1, 1)
+    points = still.double().repeat(30, 1, 1)
     points[:, 2, 1] -= 60 * (1 - torch.cos(seconds * 2))
-    points[30:60, 3] = torch.nan
+    points[10:20, 3] = torch.nan
     names = ("head", "neck", "hand_left", "hand_right")
     clip = Keypoints(points, names, fps=30.0, image_size=(640, 480))
     write_keypoints(tmp_path / "keypoints.npz", clip)
