@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,7 @@ TRAIN_PERSONS = ("s1", "s2", "s3", "s4", "s5", "s6")
 TEST_PERSONS = ("s7", "s8")
 _DATA = "kinect_utd_mhad"
 _N_PROJECTED = 100_000
+_QUICK_FRAMES = 20  # of a sequence of the test persons in a quick run
 
 
 def run(
@@ -134,7 +136,7 @@ def run(
 
 
 def people(data: str | Path, quick: bool = False) -> tuple[list[Recording], list[Recording]]:
-    """Return recordings of the training and of the test persons (a few of them if `quick`).
+    """Return recordings of the training and of the test persons (a few, short ones if `quick`).
 
     Raises:
         InputError: recordings of either are missing.
@@ -149,8 +151,19 @@ def people(data: str | Path, quick: bool = False) -> tuple[list[Recording], list
             f"found none of {', '.join(sorted(missing))}"
         )
     if quick:
-        return train[:: max(1, len(train) // 40)], tested[:: max(1, len(tested) // 10)]
+        few = tested[:: max(1, len(tested) // 10)]
+        return train[:: max(1, len(train) // 40)], [_begun(r) for r in few]
     return train, tested
+
+
+def _begun(recording: Recording) -> Recording:
+    """Return the first frames of a recording."""
+    weights = recording.weights
+    return replace(
+        recording,
+        joints=recording.joints[:_QUICK_FRAMES],
+        weights=None if weights is None else weights[:_QUICK_FRAMES],
+    )
 
 
 def sway(n_frames: int, fps: float, phase: float = 0.0) -> Float[Tensor, "T 3"]:

@@ -37,7 +37,7 @@ TRUNK = (HEAD, UPPER_BODY.index("neck"))
 HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
 THRESHOLDS = (0.2, 0.3, 0.5, 0.7, 1.0)
 SHOWN = "again"
-_QUICK_FRAMES = 40  # of the clip of a quick run
+_QUICK_FRAMES = 20  # of the clip of a quick run
 Method = Callable[[Clip], Tensor]
 
 

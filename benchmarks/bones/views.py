@@ -29,7 +29,7 @@ _PLACE, EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
 _KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
 UTD, UTD_PERSONS, UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
-_QUICK_FRAMES = 6  # of a view of a quick run
+_QUICK_FRAMES = 4  # of a view of a quick run
 
 
 def arm_rows(names: Sequence[str]) -> list[list[int]]:

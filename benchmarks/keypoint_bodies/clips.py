@@ -74,7 +74,7 @@ RIGS = (4, 3, 2, 1)
 """Numbers of cameras: the first ones of each ring."""
 
 FASTEST, LONGEST = 60.0, 300  # frames per second, frames
-_QUICK_FRAMES = 40
+_QUICK_FRAMES = 12
 _AZIMUTHS, _JITTER = (35.0, 125.0, 215.0, 305.0), 10.0  # degrees from the front to the left
 _DISTANCE, _CAMERA_HEIGHT, _NEAREST = (3.0, 5.0), (1.0, 2.5), 2.0  # metres
 _LONGEST_FOCAL, _MARGIN = 1500.0, 60.0  # pixels

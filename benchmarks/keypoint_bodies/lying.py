@@ -39,7 +39,7 @@ __all__ = ["add_lying_table", "lying_clips"]
 
 _RECORDINGS = ("s09_a02_jumping_jacks_r1", "s10_a03_bend_r1", "s11_a05_wave_two_hands_r1",
                "s12_a02_jumping_jacks_r1")  # fmt: skip
-_FRAMES, _QUICK_FRAMES = 30, 10
+_FRAMES, _QUICK_FRAMES = 30, 4
 _JOINT = 0.08  # metres, of the lowest joint above the floor
 _LEFT, _UP, _AHEAD = torch.eye(3, dtype=torch.float64)
 _QUARTER = math.pi / 2

@@ -25,7 +25,7 @@ from torchpose.evaluation import Report
 
 _FOLDER = "multicam_pose2sim"
 _SURE = 0.5  # confidence from which a keypoint of the camera left out counts
-_QUICK_FRAMES = 20
+_QUICK_FRAMES = 12
 
 
 class Filmed(NamedTuple):

@@ -38,7 +38,7 @@ def test_tables_and_files(result):
         assert 0 < errors[name, "mean"] < 100
     assert errors[MAIN, "mean"] == pytest.approx(errors[UNCALIBRATED, "mean"])
     assert set(report["moving_root_3d"].rows) >= {MAIN, SMOOTHED, BASELINE, MEAN_POSE}
-    assert "2 sequences of s7, s8, 60 frames" in report.settings["test"]
+    assert "2 sequences of s7, s8, 40 frames" in report.settings["test"]
     read = json.loads((out / "report.json").read_text())
     assert read["tables"]["errors_3d"]["rows"][MAIN]["mean"] == errors[MAIN, "mean"]
     assert len(report.pictures) == 5
