@@ -163,6 +163,7 @@ def nobody_in(folder, kind):
     return path
 
 
+@pytest.mark.usefixtures("undoubted_here")
 @pytest.mark.parametrize("kind", ["empty", "json", "table"])
 def test_a_camera_that_sees_nobody_is_left_out(track, scene, tmp_path, kind):
     nobody = nobody_in(tmp_path, kind)
@@ -194,6 +195,7 @@ def apart(poses, joints) -> float:
     return float((poses.joints3d - joints[: len(poses)]).norm(dim=-1).mean())
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_poses_from_all_kinds_of_files(track, scene, tmp_path):
     out = tmp_path / "out"
     formats = ("--formats", "trc", "c3d", "bvh", "--up", "z")
@@ -216,6 +218,7 @@ def test_poses_from_all_kinds_of_files(track, scene, tmp_path):
     assert not (out / "body.trc").exists() and not (out / "skeleton.png").exists()
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_feet_of_files_are_in_the_table_and_in_all_formats(torchpose, scene, tmp_path):
     folder, joints = scene[:2]
     cameras = CameraRig(list(load_cameras(folder / "cameras.toml").values()))
@@ -286,6 +289,7 @@ def test_cameras_are_chosen_by_their_names_too(torchpose, scene, tmp_path):
     assert "it holds cam_0 (front), cam_1 (left), cam_2 (behind)" in done.err
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_the_body_is_drawn_into_videos(track, scene, tmp_path):
     videos = tuple(f"{name}.mp4" for name in PLACES)
     done = track(tmp_path, "front_json", "left.csv", "behind.npz", "--videos", *videos)
@@ -332,6 +336,7 @@ def test_a_video_that_ends_before_the_keypoints_is_said(track, tmp_path):
     assert done.code == 0 and "a video ends after 3 frames" in done.out
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_detector_finds_the_keypoints_in_videos(track, scene, tmp_path, monkeypatch):
     folder, joints, _ = scene
     text = DETECTOR.format(points=str(folder / "points.npy"), names=BODY_15.names)
@@ -365,6 +370,7 @@ def test_cuts_of_a_video_are_noted(track, scene, tmp_path, monkeypatch):
     assert "cuts to another scene at frame 4, and bodies are tracked on" in done.out
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_inputs_of_other_lengths_sizes_and_rates(track, scene, tmp_path):
     points = scene[2]
     write_keypoints(tmp_path / "short.npz", keypoints_of(points[:-2, 2]))
@@ -388,6 +394,7 @@ def test_inputs_of_other_lengths_sizes_and_rates(track, scene, tmp_path):
     assert (done.code, "25, 50 fps are taken at the given 50 fps" in done.out) == (0, True)
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_joint_sets_may_differ_between_cameras(track, scene, tmp_path):
     """Of MediaPipe's landmarks the ears tell the head, and shoulders and hips neck and pelvis."""
     points = scene[2]
@@ -412,6 +419,7 @@ def load_camera(scene):
     return load_cameras(scene[0] / "cameras.toml")["left"]
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_page_that_begins_late_says_so(track, scene, tmp_path):
     given = []
     for camera in (0, 2):
@@ -508,6 +516,7 @@ def test_cameras_that_do_not_agree_end_with_one(track, scene, tmp_path):
     assert done.code == 0 and "no two cameras agree" not in done.err
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_delays_bring_cameras_in_step(track, scene, tmp_path):
     points = scene[2]
     late = torch.cat([points[:1, 1].expand(3, -1, -1), points[:, 1]])
