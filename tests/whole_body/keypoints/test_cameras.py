@@ -109,6 +109,7 @@ def test_whole_frames_are_found_from_pairs_of_cameras():
 # --- poses ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_turned_and_shifted_camera_is_corrected(right, tracked):
     rig = disturbed(right.rig, 1, 1.0, 0.03)
     wrong, best = track(right, rig), tracked
@@ -151,6 +152,7 @@ def test_a_rotation_leaves_a_camera_in_its_place(right):
     torch.testing.assert_close(rotvec_to_matrix(1e-6 * values[0, :3]), small)
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_poses_stay_as_given_where_delays_explain_all(late, in_step):
     found = track(late, refine="both")
     given = late.rig.translation
@@ -161,6 +163,7 @@ def test_poses_stay_as_given_where_delays_explain_all(late, in_step):
     assert not any("was turned by" in note for note in found.notes)
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_camera_that_is_left_out_since_it_is_late_is_used_again():
     rig, seen = ring(3), [jumping(-delay / FPS) for delay in (0, 8, 0)]
     pixels = torch.stack([rig(joints).pixels[:, c] for c, joints in enumerate(seen)], 1)
@@ -219,6 +222,7 @@ def test_a_refined_track_is_saved_and_read(in_step, tmp_path):
     )
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_single_frame_and_a_blind_camera_leave_cameras_as_given(right):
     tracker = BodyTracker(right.rig, "kalman", fps=FPS)
     one = tracker(keypoints=right.keypoints[:1], refine="both")
@@ -241,6 +245,7 @@ def test_what_cannot_be_refined_is_refused(right):
         several(keypoints=right.keypoints, refine="all")
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_cameras_that_are_all_turned_a_little_are_used_together():
     given = scene(4, n_frames=12)
     generator = torch.Generator().manual_seed(1)
@@ -281,6 +286,7 @@ def test_cameras_in_feet_are_refused_by_particles_and_for_several_persons(method
         tracker(**(several if method == "kalman" else {"keypoints": given.keypoints}))
 
 
+@pytest.mark.usefixtures("undoubted_here")
 @pytest.mark.parametrize(
     "height, distance, apart", [(0.65, 4.0, 1.5), (2.15, 4.0, 1.5), (1.7, 4.0, 0.01)]
 )
