@@ -4,7 +4,11 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray
+from torchpose.priors._arms import shipped_arm_prior
+from torchpose.upper_body import _arm_chain
+from torchpose.upper_body._arm_chain import ArmChain
+from torchpose.upper_body._direction_density import DirectionDensity
+from torchpose.upper_body._limb_nodes import flat_rows, nodes_anywhere, nodes_on_ray
 
 N_NEAR, N_FAR, LENGTH = 7, 5, 0.3
 
@@ -34,7 +38,9 @@ def test_chosen_pairs_are_those_of_all_pairs(kind):
     every = torch.cat(pairs, -1).flatten(2, 3)
     rows = torch.randint(N_NEAR * N_FAR, (2, 4, 9), generator=torch.Generator().manual_seed(1))
     expected = every.gather(2, rows[..., None].expand(-1, -1, -1, 6))
-    torch.testing.assert_close(far.chosen(near, rows), expected, rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        far.chosen(near, flat_rows(rows, N_NEAR * N_FAR)), expected, rtol=0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("kind", ["on-ray", "anywhere"])
@@ -42,3 +48,22 @@ def test_limbs_have_their_length(kind):
     _, far = forearms(kind)
     lengths = torch.linalg.vector_norm(far.ends - far.start[..., None, :], dim=-1)
     torch.testing.assert_close(lengths, torch.full_like(lengths, LENGTH), rtol=0, atol=1e-14)
+
+
+def test_pairs_whose_density_is_left_out_are_none_of_the_likeliest(monkeypatch):
+    chain = ArmChain(DirectionDensity(shipped_arm_prior()), 30.0)
+    near = random_axes(2, 1, 60)
+    start = 0.3 * near + torch.tensor([0.0, 0.0, 2.0])
+    ray = normalize(torch.tensor([0.1, 0.05, 1.0]).double().expand(2, 1, 1, 3), dim=-1)
+    length = torch.full((2, 1, 1), LENGTH, dtype=torch.float64)
+    far = nodes_on_ray(start, ray, length, torch.full_like(length, 0.01), 9)
+    weight, count = far.log_weight.flatten(-2), 30
+    some = chain._prior(near, far, weight, count)
+    assert 0.5 < some.isinf().double().mean() < 1
+    monkeypatch.setattr(_arm_chain, "_MANY", 1000)
+    every = chain._prior(near, far, weight, count)
+    left = some.isfinite()
+    torch.testing.assert_close(some[left], every[left], rtol=0, atol=1e-10)
+    best = (weight + every).topk(count, -1).indices
+    assert left.gather(-1, best).all()
+    assert every.amax() - every.amin() <= chain.density.log_ratio

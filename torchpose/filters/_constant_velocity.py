@@ -1,5 +1,6 @@
 """Filter and smooth numbers that move at nearly constant velocity, by a Kalman filter."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -30,7 +31,7 @@ class ConstantVelocityState(NamedTuple):
 
 
 class _Gains(NamedTuple):
-    """Holds the motion matrix [2, 2], and gains frame by frame: filter [S, 2], smoother [S, 2, 2]."""
+    """Holds the motion matrix [2, 2], and gains frame by frame: filter [S, 2, 1], smoother [S, 2, 2]."""
 
     matrix: Tensor
     filter: Tensor
@@ -91,28 +92,14 @@ class ConstantVelocityFilter(nn.Module):
         self, state: ConstantVelocityState, z: Float[Tensor, "B N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B N"]]:
         """Filter one frame: the same numbers as the same frame of `forward`."""
-        state, _ = self._advance(state, z)
+        state, _ = _next(self._gains(), state, z)
         return state, state.mean[:, 0]
 
     def advance(
         self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
         """Filter some more frames: the same numbers as `step` for one after the other."""
-        found = []
-        for frame in z.unbind(1):
-            state, _ = self._advance(state, frame)
-            found.append(state.mean[:, 0])
-        return state, torch.stack(found, 1)
-
-    def _advance(
-        self, state: ConstantVelocityState, z: Tensor
-    ) -> tuple[ConstantVelocityState, Tensor]:
-        """Return the next state, and by how much it differs from its prediction [B, 2, N]."""
-        known = self._gains()
-        predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
-        gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
-        correction = gain * (z[:, None] - predicted[:, :1])
-        return ConstantVelocityState(predicted + correction, state.time + 1), correction
+        return _advanced(self._gains(), state, z)
 
     def forward(
         self, z: Float[Tensor, "B T N"], *, lengths: Integer[Tensor, " B"] | None = None
@@ -137,7 +124,7 @@ class ConstantVelocityFilter(nn.Module):
         """Return the state after all frames, filtered means, and these minus predicted, [B, T, 2, N]."""
         means, corrections = [], []
         for frame in z.unbind(1):
-            state, correction = self._advance(state, frame)
+            state, correction = _next(self._gains(), state, frame)
             means.append(state.mean)
             corrections.append(correction)
         return state, torch.stack(means, 1), torch.stack(corrections, 1)
@@ -194,6 +181,54 @@ class ConstantVelocityFilter(nn.Module):
     def extra_repr(self) -> str:
         """Return the settings, for printing."""
         return f"ratio={float(self.ratio):g}, fps={float(self.fps):g}"
+
+
+class VelocityFilters:
+    """Filters of constant velocity, each over some of the numbers, which are advanced all at once.
+
+    Args:
+        filters: of one frame rate. counts: how many of the numbers each filters, one after the other.
+    """
+
+    def __init__(self, filters: Sequence[ConstantVelocityFilter], counts: Sequence[int]) -> None:
+        known = [own._gains() for own in filters]
+        n_frames = max(len(gains.filter) for gains in known)
+        columns = [
+            torch.cat(
+                [gains.filter, gains.filter[-1:].expand(n_frames - len(gains.filter), -1, -1)]
+            )
+            for gains in known
+        ]
+        counted = zip(columns, counts, strict=True)
+        joined = torch.cat([gains.expand(-1, -1, count) for gains, count in counted], -1)
+        self._gains = known[0]._replace(filter=joined)
+
+    def advance(
+        self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
+    ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
+        """Filter some more frames, as `ConstantVelocityFilter.advance`."""
+        return _advanced(self._gains, state, z)
+
+
+def _advanced(
+    known: _Gains, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
+) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
+    """Return the state after some more frames, and their filtered numbers."""
+    found = []
+    for frame in z.unbind(1):
+        state, _ = _next(known, state, frame)
+        found.append(state.mean[:, 0])
+    return state, torch.stack(found, 1)
+
+
+def _next(
+    known: _Gains, state: ConstantVelocityState, z: Float[Tensor, "B N"]
+) -> tuple[ConstantVelocityState, Float[Tensor, "B 2 N"]]:
+    """Return the next state, and by how much it differs from its prediction."""
+    predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
+    gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
+    correction = gain * (z[:, None] - predicted[:, :1])
+    return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
 
 def _held(numbers: Float[Tensor, "B T N"], lengths: Int[Tensor, " B"]) -> Float[Tensor, "B T N"]:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.value_checks import values_visible
+from torchpose._core.value_checks import seen_finite, values_visible
 from torchpose._core.wording import counted
 from torchpose.errors import DegenerateFilterWarning
 
@@ -168,6 +168,8 @@ def finish_output(
 
 def first_not_finite(values: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
     """Return the first frame in which any value is NaN or infinite, -1 where none is."""
+    if seen_finite(values):
+        return torch.full_like(values[:, 0, 0], -1, dtype=torch.long)
     bad = ~torch.isfinite(values).all(-1)
     first = bad.int().argmax(1)
     return torch.where(bad.any(1), first, -1)

@@ -10,7 +10,7 @@ import math
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_shape
@@ -21,7 +21,7 @@ from torchpose.math._gaussian import safe_eigh
 RotationOrder = Literal["zxy", "zyx"]
 ROTATION_ORDERS: tuple[RotationOrder, ...] = ("zxy", "zyx")
 
-_SINES_AND_COSINES = ("sr", "sp", "sy", "cr", "cp", "cy")
+_ANGLES = "rpy"
 # The entries of R, row by row, of sines and cosines of roll, pitch and yaw: sums of up to two products.
 _EULER = {
     "zxy": (
@@ -37,21 +37,30 @@ _EULER = {
 }  # fmt: skip
 
 
-def _euler_terms(order: RotationOrder) -> tuple[Int[Tensor, "3 2 9"], Float[Tensor, "2 9"]]:
-    """Return the three factors of both products of each entry of R, and the signs of these.
+def _euler_terms(order: RotationOrder) -> tuple[Float[Tensor, "3 S"], Float[Tensor, "2*S 9"]]:
+    """Return sums of the angles, and the weights of their cosines and sines in each entry of R.
 
-    A factor is a place among `_SINES_AND_COSINES`, or behind them where it is 1; the sign of a product that
-    there is not is 0.
+    Products of sines and cosines are sums of those of sums of their angles, so R takes one product with
+    these weights. A product is kept by the exponentials of which it consists,
+    cos a = (e^ia + e^-ia) / 2 and sin a = (e^ia - e^-ia) / 2i, of which those of a sum and of its negative
+    are conjugates.
     """
-    factors = torch.full((3, 2, 9), len(_SINES_AND_COSINES))
-    signs = torch.zeros(2, 9, dtype=torch.float64)
-    for entry, products in enumerate(_EULER[order]):
-        for row, product in enumerate(products):
-            names = product.removeprefix("-").split()
-            places = [_SINES_AND_COSINES.index(name) for name in names]
-            factors[: len(names), row, entry] = torch.tensor(places)
-            signs[row, entry] = -1.0 if product.startswith("-") else 1.0
-    return factors, signs
+    entries = [sum(map(_exponentials, products)) for products in _EULER[order]]
+    coefficients = torch.stack(entries).flatten(1)  # [9, 27], of the sums with factors -1, 0 and 1
+    factors = torch.cartesian_prod(*[torch.arange(-1.0, 2.0, dtype=torch.float64)] * 3)
+    used = [row for row in range(14, 27) if bool((coefficients[:, row] != 0).any())]
+    known = 2 * coefficients[:, used].mT
+    return factors[used].mT.contiguous(), torch.cat([known.real, -known.imag])
+
+
+def _exponentials(product: str) -> Tensor:
+    """Return the coefficients of e^i(k_r r + k_p p + k_y y) in a product, k = -1, 0 and 1, [3, 3, 3]."""
+    parts = torch.eye(3, dtype=torch.complex128)[1].repeat(3, 1)
+    for factor in product.removeprefix("-").split():
+        sine = factor.startswith("s")
+        parts[_ANGLES.index(factor[1])] = torch.tensor([0.5j, 0, -0.5j] if sine else [0.5, 0, 0.5])
+    sign = -1.0 if product.startswith("-") else 1.0
+    return sign * torch.einsum("r,p,y->rpy", *parts)
 
 
 with outside_inference():
@@ -83,10 +92,9 @@ def euler_to_matrix(
     """
     check_shape("angles", angles, ["...", 3])
     _check_order(order)
-    factors, signs = _EULER_TERMS[order]
-    known = torch.cat([angles.sin(), angles.cos(), torch.ones_like(angles[..., :1])], -1)
-    first, second, third = known[..., factors.to(angles.device)].unbind(-3)
-    return (signs.to(angles) * first * second * third).sum(-2).unflatten(-1, (3, 3))
+    factors, weights = _EULER_TERMS[order]
+    sums = angles @ factors.to(angles)
+    return (torch.cat([sums.cos(), sums.sin()], -1) @ weights.to(angles)).unflatten(-1, (3, 3))
 
 
 def matrix_to_euler(
@@ -380,8 +388,23 @@ def procrustes(
     count = weight.sum(-2, keepdim=True)
     s, x = torch.where(use, source, 0.0), torch.where(use, target, 0.0)
     s_mean, x_mean = (points.sum(-2, keepdim=True) / count.clamp_min(1) for points in (s, x))
-    u, _, vh = torch.linalg.svd(((x - x_mean) * weight).mT @ (s - s_mean))
+    rotation = _nearest_rotation(((x - x_mean) * weight).mT @ (s - s_mean))
+    rotation = rotation.masked_fill(count < 3, math.nan)
+    return RigidMotion(rotation, (x_mean - s_mean @ rotation.mT).squeeze(-2))
+
+
+def motion_of_all(
+    source: Float[Tensor, "*batch N 3"], target: Float[Tensor, "*batch N 3"]
+) -> RigidMotion:
+    """Return what `procrustes` does of points of one precision that are all finite, three or more."""
+    s_mean, x_mean = (points.mean(-2, keepdim=True) for points in (source, target))
+    rotation = _nearest_rotation((target - x_mean).mT @ (source - s_mean))
+    return RigidMotion(rotation, (x_mean - s_mean @ rotation.mT).squeeze(-2))
+
+
+def _nearest_rotation(cross: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return U diag(1, 1, det(U V^T)) V^T of a matrix U S V^T."""
+    u, _, vh = torch.linalg.svd(cross)
     sign = torch.linalg.det(u @ vh)
     last = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    rotation = ((u * last[..., None, :]) @ vh).masked_fill(count < 3, math.nan)
-    return RigidMotion(rotation, (x_mean - s_mean @ rotation.mT).squeeze(-2))
+    return (u * last[..., None, :]) @ vh

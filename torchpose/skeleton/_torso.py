@@ -13,14 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
+from torchpose._core.value_checks import seen_finite
 from torchpose.errors import PriorError
-from torchpose.math._rotations import procrustes
+from torchpose.math._rotations import motion_of_all, procrustes
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 ALIGN_JOINTS = (3, 4, 2, 5)
 """Head, neck and both shoulders of the 8-joint upper body: what the paper aligns (BL section 6)."""
-
-_ALIGNED = slice(min(ALIGN_JOINTS), max(ALIGN_JOINTS) + 1)  # they lie side by side
 
 _ALIGNED = slice(min(ALIGN_JOINTS), max(ALIGN_JOINTS) + 1)  # they lie side by side
 
@@ -63,7 +62,9 @@ def onto_torso(
     Args:
         pose, covs: in the axes of the torso. joints: of which only head, neck and shoulders count.
     """
-    motion = procrustes(pose[..., _ALIGNED, :], joints[..., _ALIGNED, :])
+    source, target = pose[..., _ALIGNED, :], joints[..., _ALIGNED, :]
+    align = motion_of_all if seen_finite(source) and seen_finite(target) else procrustes
+    motion = align(source, target)
     moved = pose @ motion.rotation.mT + motion.translation[..., None, :]
     turn = motion.rotation[..., None, :, :]
     return moved, turn @ covs @ turn.mT

@@ -14,7 +14,13 @@ from torch import Tensor
 from torchpose._core.module_state import outside_inference
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._direction_density import DirectionDensity
-from torchpose.upper_body._limb_nodes import LimbNodes, nodes_anywhere, nodes_on_ray, take_rows
+from torchpose.upper_body._limb_nodes import (
+    LimbNodes,
+    flat_rows,
+    nodes_anywhere,
+    nodes_on_ray,
+    take_rows,
+)
 from torchpose.upper_body._torso_occlusion import log_in_view
 
 _ANGLES = 17  # of a bone whose end is measured
@@ -27,6 +33,9 @@ _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose h
 _LATER = 0.25
 _RATE = 30.0
 _LEAST = 1e-30  # density
+# Pairs of directions for each hypothesis from which on, and share of them at most of which, densities are
+# computed pair by pair.
+_MANY, _FEW = 4, 2
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 # Arms of which all pairs of directions are compared at a time: intermediate results stay in the cache.
 _ARMS = 2
@@ -194,14 +203,44 @@ class ArmChain:
             count: the number of hypotheses, at most.
         """
         uppers = upper.directions.expand_as(upper.ends)
-        prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
         if weight.shape[-1] <= count:
+            prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
             shape = *upper.ends.shape[:-1], len(lower.turns), 3
             bones = uppers[..., None, :], lower.directions
             directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
             return Arms(directions, weight, prior)
+        prior = self._prior(uppers, lower, weight, count)
         best = (weight + prior).topk(count, -1, sorted=False).indices
-        return Arms(lower.chosen(uppers, best), weight.gather(-1, best), prior.gather(-1, best))
+        return Arms(
+            lower.chosen(uppers, flat_rows(best, weight.shape[-1])),
+            weight.gather(-1, best),
+            prior.gather(-1, best),
+        )
+
+    def _prior(
+        self,
+        uppers: Float[Tensor, "*batch U 3"],
+        lower: LimbNodes,
+        weight: Float[Tensor, "*batch N"],
+        count: int,
+    ) -> Float[Tensor, "*batch N"]:
+        """Return the log-density of the prior at all pairs, or -inf where weights rule a pair out.
+
+        The density has a least and a largest value, so a pair that is farther than their ratio below the
+        weight of rank `count` is none of the `count` likeliest. Of forearms to hands that are measured few
+        others are left.
+
+        Args:
+            uppers: the directions of the upper arms. lower, weight, count: as of `_likeliest`.
+        """
+        if weight.shape[-1] >= _MANY * count:
+            least = weight.kthvalue(weight.shape[-1] - count + 1, -1, keepdim=True).values
+            left = (weight >= least - self.density.log_ratio).flatten().nonzero()[:, 0]
+            if len(left) * _FEW <= weight.numel():
+                prior = self.density(lower.chosen(uppers, left))
+                nothing = torch.full_like(weight, -torch.inf).flatten()
+                return nothing.index_copy(0, left, prior).view_as(weight)
+        return self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.

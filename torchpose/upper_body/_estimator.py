@@ -369,6 +369,8 @@ def _held(values: Iterable[Tensor], lengths: Int[Tensor, " B"]) -> list[Tensor]:
 
 def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
     """Return the first frame at which either arm degenerated, -1 where none did, [B]."""
+    if left.failed_at is right.failed_at:
+        return left.failed_at
     n_frames = left.mean.shape[1]
     failures = torch.stack([left.failed_at, right.failed_at])
     first = failures.where(failures >= 0, n_frames).amin(0)

@@ -6,7 +6,6 @@ from one component to the next show as jitter. `MotionStage` filters (or smooths
 
 from collections.abc import Mapping
 from functools import cache
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,7 +20,11 @@ from torchpose.camera._projection import (
     pixel_covariances,
 )
 from torchpose.camera._virtual_camera import from_view
-from torchpose.filters._constant_velocity import ConstantVelocityFilter, ConstantVelocityState
+from torchpose.filters._constant_velocity import (
+    ConstantVelocityFilter,
+    ConstantVelocityState,
+    VelocityFilters,
+)
 from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -187,12 +190,8 @@ def recalibrated(
     return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
 
 
-class MotionStageState(NamedTuple):
-    """State of a `MotionStage`: of its filters over joints, their pixels and the body's placement."""
-
-    joints: ConstantVelocityState
-    pixels: ConstantVelocityState
-    placement: ConstantVelocityState
+MotionStageState = ConstantVelocityState
+"""State of a `MotionStage`: of all its numbers, those of joints, then of pixels, then of the placement."""
 
 
 class MotionStage(nn.Module):
@@ -224,26 +223,32 @@ class MotionStage(nn.Module):
                 it are not used.
             lag: the number of later frames that each may use; None is all, 0 only filters.
         """
-        pairs = zip(self._filters(), _numbers(reading), strict=True)
         if lag == 0:
-            return _with_numbers(reading, *(model(values) for model, values in pairs))
+            return self.advance(self.init(reading), reading)[1]
+        pairs = zip(self._filters(), _numbers(reading), strict=True)
         return _with_numbers(
             reading, *(model.smooth_frames(values, lengths, lag) for model, values in pairs)
         )
 
     def init(self, reading: ReadOut) -> MotionStageState:
         """Return the state before the first frame, that of `reading` [B, T, ...]."""
-        pairs = zip(self._filters(), _numbers(reading), strict=True)
-        return MotionStageState(*(model.init(values[:, 0]) for model, values in pairs))
+        return self.joints.init(torch.cat(_numbers(reading), -1)[:, 0])
 
     def advance(
         self, state: MotionStageState, reading: ReadOut
     ) -> tuple[MotionStageState, ReadOut]:
         """Return the next state and some more frames [B, T, ...]: the numbers of `forward` with lag 0."""
-        triples = zip(self._filters(), state, _numbers(reading), strict=True)
-        advanced = [model.advance(own, values) for model, own, values in triples]
-        steady = _with_numbers(reading, *(values for _, values in advanced))
-        return MotionStageState(*(own for own, _ in advanced)), steady
+        numbers, filters = _numbers(reading), self._filters()
+        counts = [values.shape[-1] for values in numbers]
+        ratios = tuple(model.ratio for model in filters)
+        all_filters = derived(
+            self,
+            ("all", *counts),
+            (*ratios, self.joints.fps),
+            lambda: VelocityFilters(filters, counts),
+        )
+        state, steady = all_filters.advance(state, torch.cat(numbers, -1))
+        return state, _with_numbers(reading, *steady.split(counts, -1))
 
     def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
         return self.joints, self.pixels, self.placement

@@ -45,20 +45,20 @@ class LimbNodes:
         return self.start[..., None, :] + self.length[..., None, None] * self.directions
 
     def chosen(
-        self, near: Float[Tensor, "*batch G0 3"], rows: Int[Tensor, "*batch N"]
-    ) -> Float[Tensor, "*batch N 6"]:
+        self, near: Float[Tensor, "*batch G0 3"], rows: Int[Tensor, "*rows"]
+    ) -> Float[Tensor, "*rows 6"]:
         """Return the directions of some pairs of the limb before, which has G0, and of this one.
 
         Args:
             near: the directions of the limb before, from whose far ends this one starts.
-            rows: the pairs, as rows of G0 G.
+            rows: the pairs, as rows of all pairs of the batch, G0 G of each element (`flat_rows`).
         """
         count = len(self.turns)
         axes = self.axes.expand(*near.shape[:-1], -1, 3).flatten(-2)
-        bones = take_rows(torch.cat([near, axes], -1), rows // count)
-        first, *along = bones.unflatten(-1, (-1, 3)).unbind(-2)
-        turns = self.turns[rows % count][..., None].unbind(-2)
-        return torch.cat([first, _sum_of(turns, along)], -1)
+        bones = torch.cat([near, axes], -1).flatten(0, -2).unflatten(-1, (-1, 1, 3))
+        first, *along = bones.index_select(0, (rows // count).flatten()).unbind(1)
+        turns = self.turns.index_select(0, (rows % count).flatten())[..., None, None].unbind(1)
+        return torch.cat([first, _sum_of(turns, along)], -1).view(*rows.shape, 6)
 
 
 def nodes_on_ray(
@@ -118,9 +118,14 @@ def take_rows(
 ) -> Float[Tensor, "*batch K D"]:
     """Return some rows of each batch element; whole rows are taken faster than by `gather`."""
     n, size = values.shape[-2:]
-    flat = values.reshape(-1, size)
-    start = torch.arange(0, len(flat), n, device=rows.device).view(*rows.shape[:-1], 1)
-    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, size)
+    flat = values.reshape(-1, size).index_select(0, flat_rows(rows, n).flatten())
+    return flat.view(*rows.shape, size)
+
+
+def flat_rows(rows: Int[Tensor, "*batch K"], n: int) -> Int[Tensor, "*batch K"]:
+    """Return rows of each batch element, which has n, as rows of all of them."""
+    before = torch.arange(0, n * rows.shape[:-1].numel(), n, device=rows.device)
+    return rows + before.view(*rows.shape[:-1], 1)
 
 
 def _turned(

@@ -19,6 +19,7 @@ from torchpose._core.checks import (
     refuse_half,
 )
 from torchpose._core.module_state import derived, index_tensor
+from torchpose._core.value_checks import seen_finite
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
@@ -172,8 +173,11 @@ def measured_keypoints(
         InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
         ShapeError: confidence or mask do not fit the keypoints.
     """
-    check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
-    measured = torch.isfinite(keypoints).all(-1)
+    if seen_finite(keypoints):
+        measured = torch.ones_like(keypoints[..., 0], dtype=torch.bool)
+    else:
+        check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
+        measured = torch.isfinite(keypoints).all(-1)
     check_tensors(mask=mask)
     if mask is not None:
         check_shape("mask", mask, list(measured.shape))
