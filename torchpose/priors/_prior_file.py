@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.checks import check_covariance
+from torchpose._core.module_state import outside_inference
 from torchpose._core.tensor_file import (
     FileKind,
     info_from_json,
@@ -26,6 +28,18 @@ from torchpose.priors._arm_state import check_rotation_order
 
 SKELETON = "upper-body-8"
 CENTRES = ("neck", "head", "sequence")
+
+
+def _camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+@lru_cache(maxsize=16)
+def _kept_matrix(
+    fx: float, fy: float, cx: float, cy: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    with outside_inference():
+        return _camera_matrix(fx, fy, cx, cy).to(device, dtype)
 
 
 @dataclass(frozen=True)
@@ -97,8 +111,11 @@ class PriorInfo:
     @property
     def matrix(self) -> Tensor:
         """Return the camera matrix K [3, 3], pixels."""
-        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
-        return torch.tensor(rows, dtype=torch.float64)
+        return _camera_matrix(self.fx, self.fy, self.cx, self.cy)
+
+    def matrix_like(self, like: Tensor) -> Tensor:
+        """Return the camera matrix as another tensor is, the same one each time: not to be written to."""
+        return _kept_matrix(self.fx, self.fy, self.cx, self.cy, like.dtype, like.device)
 
     def to_json(self) -> str:
         """Return text that `from_json` reads back."""

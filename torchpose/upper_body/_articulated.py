@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +50,7 @@ from torchpose.upper_body._direction_density import DirectionDensity
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,
+    Bones,
     Estimates,
     Estimator,
     TrackerModel,
@@ -70,6 +72,22 @@ _AT_ONCE = 32  # frames whose poses are read together
 _BODIES_AT_ONCE = 4  # frames times sequences whose arms are weighed together: more gain nothing
 
 
+class _Told(NamedTuple):
+    """What the poses of a frame hold of torso and lengths, which most frames share with the one before.
+
+    Attributes:
+        bones: the lengths of bones as they are reported, given the belief `lengths` and the moments `before`.
+        others: the covariances of limbs over the hypotheses `roots`, given `sizes`.
+    """
+
+    lengths: Lengths
+    before: Moments
+    bones: Bones
+    roots: Roots
+    sizes: Sizes
+    others: Tensor
+
+
 class ArticulatedState(NamedTuple):
     """State of `ArticulatedFilter` between two frames.
 
@@ -87,6 +105,8 @@ class ArticulatedState(NamedTuple):
         starts: the number of updates at which a body may still start, [B]; None if 0 for everybody. It starts
             where an elbow or hand is seen beside two joints of the torso, since one joint has no size in the
             image, and so no depth that arms could rule out; and starts again until the frame fits a body.
+        told: what the pose of the last frame holds of torso and lengths; None before the first, and after
+            several frames at a time.
     """
 
     root: Tensor
@@ -101,6 +121,7 @@ class ArticulatedState(NamedTuple):
     tilt: Tensor
     frame: int
     starts: Tensor | None
+    told: _Told | None = None
 
 
 class _Seen(NamedTuple):
@@ -241,15 +262,12 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        poses, waiting = [], []
-        for step in self._steps(state, measured, progress):
-            state = step.state
-            waiting.append((step.seen, step.arms))
-            if len(waiting) == _AT_ONCE:
-                poses.append(self._poses(waiting))
-                waiting = []
-        if waiting:
-            poses.append(self._poses(waiting))
+        steps, poses = self._steps(state, measured, progress), []
+        while waiting := [*islice(steps, _AT_ONCE)]:
+            state, told = waiting[-1].state, waiting[-1].state.told
+            pose, told = self._poses([(step.seen, step.arms) for step in waiting], told)
+            poses.append(pose)
+            state = state._replace(told=told if len(waiting) == 1 else None)
         return state, self._estimates(poses, len(measured.uv))
 
     def forward(
@@ -272,7 +290,7 @@ class ArticulatedFilter(Estimator):
         lag = int(smoothing) - self.ahead if isinstance(smoothing, int) else None
         found = list(zip(seen, self.chain.smoothed(arms, lengths, lag), strict=True))
         parts = (found[i : i + _AT_ONCE] for i in range(0, len(found), _AT_ONCE))
-        poses = [self._poses(part) for part in parts]
+        poses = [self._poses(part)[0] for part in parts]
         return repeat_last(self._estimates(poses, len(measured.uv)), lengths)
 
     def filtered(
@@ -449,9 +467,16 @@ class ArticulatedFilter(Estimator):
         fields = {name: _where(chosen, new, getattr(state, name)) for name, new in begun.items()}
         return state._replace(**fields)
 
-    def _poses(self, found: Sequence[tuple[_Seen, ArmState]]) -> FramePose:
-        """Return the estimates of T frames of all B sequences at once, [B T, ...]."""
+    def _poses(
+        self, found: Sequence[tuple[_Seen, ArmState]], told: _Told | None = None
+    ) -> tuple[FramePose, _Told]:
+        """Return the estimates of T frames of all B sequences at once, and what they hold of torsos.
+
+        Args:
+            found: what they are read from. told: that of the frame before, which most frames share.
+        """
         seen, arms = together(found)
+        told = self._told(seen, told)
         frame = upright(seen.frame, seen.facts, seen.tilt)
         torso, turn = seen.sizes.torso, self.grid.turn
         body = SeenBody(
@@ -470,15 +495,27 @@ class ArticulatedFilter(Estimator):
             exact=seen.frame.exact,
             std=torch.where(seen.frame.known, seen.frame.std, 0.0),
             lengths=seen.sizes.metres,
-            bones=self.lengths.shown(seen.lengths, seen.before.size, seen.before.of_size),
+            bones=told.bones,
             scale=self.lengths.scale.expand(len(seen.tilt)),
-            others=covs_of_roots(seen.roots, seen.sizes.metres),
+            others=told.others,
             far=seen.after.of_depth,
-            turn=seen.root.turn[:, 0],
+            axes=seen.root.axes[:, 0],
             tilt=seen.tilt,
         )
         pose = pose_of(body, arms, self.optics.log_focal, self.model.calibrated)
-        return pose if self.lengths.unit == 1.0 else enlarged(pose, self.lengths.unit)
+        return (pose if self.lengths.unit == 1.0 else enlarged(pose, self.lengths.unit)), told
+
+    def _told(self, seen: _Seen, last: _Told | None) -> _Told:
+        """Return what poses hold of torso and lengths, of which `last` keeps what is as it was."""
+        if last is not None and seen.lengths is last.lengths and seen.before is last.before:
+            bones = last.bones
+        else:
+            bones = self.lengths.shown(seen.lengths, seen.before.size, seen.before.of_size)
+        if last is not None and seen.roots is last.roots and seen.sizes is last.sizes:
+            others = last.others
+        else:
+            others = covs_of_roots(seen.roots, seen.sizes.metres)
+        return _Told(seen.lengths, seen.before, bones, seen.roots, seen.sizes, others)
 
     def _estimates(self, poses: Sequence[FramePose], batch_size: int) -> Estimates:
         return estimates_of(poses, batch_size, self.optics.matrix, self.lengths.names)

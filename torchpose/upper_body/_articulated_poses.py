@@ -12,7 +12,6 @@ from torch import Tensor
 from torchpose._core.module_state import index_tensor
 from torchpose.filters._outputs import FilterOutput, first_not_finite
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import ArmState, mirrored
 from torchpose.upper_body._articulated_frame import HANDS, LIMBS, SHOULDERS
 from torchpose.upper_body._estimator import Bones, Estimates, SeenPoses
@@ -41,7 +40,8 @@ class SeenBody(NamedTuple):
         scale: the standard deviation of the log of their common scale, [B].
         others: the covariances of `LIMBS` over the hypotheses of the root (`covs_of_roots`), [B, 4, 3, 3].
         far: the variance of the log of the depth, [B].
-        turn: the turn of the shoulders, radians, [B]. tilt: the roll of the tilted axes, [B, 3, 3].
+        axes: the rotation from tilted to upright axes that turn with the shoulders, [B, 3, 3].
+        tilt: the roll of the tilted axes, [B, 3, 3].
     """
 
     joints: Tensor
@@ -55,7 +55,7 @@ class SeenBody(NamedTuple):
     scale: Tensor
     others: Tensor
     far: Tensor
-    turn: Tensor
+    axes: Tensor
     tilt: Tensor
 
 
@@ -111,7 +111,7 @@ def pose_of(
         log_focal: the log of the focal length, pixels. calibrated: whether the covariances of measured arms
             are scaled as recordings of other persons needed.
     """
-    axes, rows = upright_axes(body.turn), index_tensor(LIMBS, body.turn.device)
+    axes, rows = body.axes, index_tensor(LIMBS, body.axes.device)
     shoulders = body.joints[:, SHOULDERS]
     ends = bones_of(belief.directions, axes[:, None, None], body.lengths).cumsum(-2)
     weight = belief.weight[..., None]

@@ -180,7 +180,7 @@ def covs_of_roots(roots: Roots, lengths: Float[Tensor, "B 4"]) -> Float[Tensor, 
     """
     root, near = roots.root, roots.near
     shoulder = roots.shoulders - roots.middle[:, None]
-    bones = bones_of(roots.directions, upright_axes(root.turn)[:, None], lengths)
+    bones = bones_of(roots.directions, root.axes[:, None], lengths)
     ends = shoulder[..., None, :] + bones.cumsum(-2)
     used = (near[:, None, :, None, None] * ends).sum(2, keepdim=True)
     off = (ends - used).transpose(2, 3).flatten(1, 2)
@@ -199,7 +199,7 @@ def _arm_input(
     given, depth = frame.given, shoulders[..., 2:].clamp_min(0.1)
     noise = given.own + given.stiff / root.depth.mean(1).square()[:, None, None]
     loose = (slack.square() + _SLACK**2)[:, None, None]
-    axes = upright_axes(root.turn)
+    axes = root.axes
     limbs = frame.limbs[:, :, None].expand(-1, -1, shoulders.shape[2], -1, -1)
     middle = shoulders.mean(1, keepdim=True).expand_as(shoulders)
     # the shoulder and the middle of both, then the rays of elbow and hand
@@ -251,7 +251,8 @@ def _mean_of(root: Root, near: Float[Tensor, "B M"]) -> Root:
     depth = (near * root.depth.log()).sum(1, keepdim=True).exp()
     size = (near * root.size.log()).sum(1, keepdim=True).exp()
     turn = best + (near * off).sum(1, keepdim=True)
-    return Root(depth, turn, size, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
+    none, cell = torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1])
+    return Root(depth, turn, size, none, cell, upright_axes(turn))
 
 
 def _shares_of_mode(root: Root) -> Float[Tensor, "B M"]:

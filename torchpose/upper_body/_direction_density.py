@@ -66,7 +66,8 @@ class DirectionDensity:
 
     def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
         """Return log p(d_u, d_f)."""
-        parts = [self._densities(rows).sum(-1) for rows in directions.flatten(0, -2).split(_ROWS)]
+        ones = self._ones.new_ones(len(self._ones) + 1)
+        parts = [self._densities(rows) @ ones for rows in directions.flatten(0, -2).split(_ROWS)]
         return torch.cat(parts).log().to(directions.dtype).view(directions.shape[:-1])
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:

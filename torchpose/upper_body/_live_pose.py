@@ -104,6 +104,8 @@ def unseen_frames(before: Int[Tensor, " B"], seen: Bool[Tensor, "B T"]) -> Int[T
         before: that number before them. seen: whether anything was measured in each.
     """
     n_frames = seen.shape[1]
+    if n_frames == 1:
+        return (before + 1).masked_fill(seen[:, 0], 0)
     frames = torch.arange(1, n_frames + 1, device=seen.device)
     last = torch.where(seen, frames, torch.zeros_like(frames)).amax(1)
     return torch.where(last > 0, n_frames - last, before + n_frames)

@@ -314,7 +314,7 @@ def in_prior_pixels(
         face = face._replace(places=to_prior.points(face.places))
         measured = measured._replace(face=face)
     measured = in_level_pixels(
-        measured, kept_turn(camera, prior), prior.info.matrix.to(measured.uv)
+        measured, kept_turn(camera, prior), prior.info.matrix_like(measured.uv)
     )
     if not picked.middle:
         return measured

@@ -95,7 +95,7 @@ class MultipleModelFilter(Estimator):
             self.causal = _windows_of_limbs(model._replace(smoothing=None))
         self.articulated = ArticulatedFilter(model, arms)
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
-        self.matrix = model.prior.info.matrix.to(model.measurement_cov)
+        self.matrix = model.prior.info.matrix_like(model.measurement_cov)
         self.order = model.prior.info.rotation_order
 
     def init(
@@ -223,13 +223,18 @@ class MultipleModelFilter(Estimator):
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
             mixed = mixed._replace(covs=trust[..., None, None, None] * mixed.covs)
-        logs = torch.stack([share.log(), torch.log1p(-share)], -1)
-        failed_at, arms = first_not_finite(mixed.joints.flatten(2)), []
-        for ours, theirs in ((seen.left, bodies.left), (seen.right, bodies.right)):
-            both = torch.stack([ours.log_evidence, theirs.log_evidence], -1)
-            evidence = torch.logsumexp(logs + both, -1)
-            arms.append(theirs._replace(log_evidence=evidence, failed_at=failed_at))
-        return Estimates(arms[0], arms[1], None, mixed, bodies.bones)
+        logs = share.log(), torch.log1p(-share)
+        failed_at = first_not_finite(mixed.joints.flatten(2))
+        ours, theirs = (
+            torch.stack([found.left.log_evidence, found.right.log_evidence])
+            for found in (seen, bodies)
+        )
+        evidence = torch.logaddexp(logs[0] + ours, logs[1] + theirs).unbind()
+        left, right = (
+            arm._replace(log_evidence=own, failed_at=failed_at)
+            for arm, own in zip(bodies[:2], evidence, strict=True)
+        )
+        return Estimates(left, right, None, mixed, bodies.bones)
 
 
 def _windows_of_limbs(model: TrackerModel) -> WindowMixture:

@@ -83,7 +83,7 @@ class PoseReader(NamedTuple):
             lengths: of whole sequences, the number of frames of each, [B]; past it the last pose is
                 repeated. None is T.
         """
-        matrix, poses = self.prior.info.matrix.to(estimates.left.mean), estimates.poses
+        matrix, poses = self.prior.info.matrix_like(estimates.left.mean), estimates.poses
         if poses is None:
             reading = read_out(estimates, matrix, self.order)
             motion, reading = self._steadied(motion, reading, estimates, lengths)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._torso_likelihood import Root, Torso, TorsoLengths, torso_log_likelihood
 
 # Metres, as the Kinect recordings have it, and of its log: others sit at webcams, or stand in halls.
@@ -64,6 +65,7 @@ class RootGrid:
         n_turns = round(360.0 / _TURN_STEP)
         degrees = _TURN_STEP * (torch.arange(n_turns, dtype=like.dtype) - n_turns // 2)
         self.turn = torch.deg2rad(degrees).to(like.device)
+        self._axes = upright_axes(self.turn)
         usual = torch.softmax(-0.5 * (degrees / _TURN_STD).square(), 0).to(like.device)
         near = torch.softmax(
             -0.5 * ((self.depth.log() - math.log(_DEPTH)) / _DEPTH_STD).square(), 0
@@ -177,8 +179,14 @@ class RootGrid:
         share = weight.flatten(2).gather(2, of_sizes)
         total = share.sum(1)
         size = ((share.mT @ self.log_size) / total).exp()
+        turns = index % n_turns
         return Root(
-            self.depth[index // n_turns], self.turn[index % n_turns], size, total.log(), index
+            self.depth[index // n_turns],
+            self.turn[turns],
+            size,
+            total.log(),
+            index,
+            self._axes[turns],
         )
 
     def belief(

@@ -77,6 +77,7 @@ class Root(NamedTuple):
         depth: of the middle of the shoulders, metres. turn: psi, radians. size: of the torso, as a factor
             on `TorsoLengths`. log_weight: the log-weight of each hypothesis.
         cell: its index in the flat grid of depths and turns.
+        axes: the rotations from camera to upright axes that turn with the shoulders, [B, M, 3, 3].
     """
 
     depth: Tensor
@@ -84,6 +85,7 @@ class Root(NamedTuple):
     size: Tensor
     log_weight: Tensor
     cell: Tensor
+    axes: Tensor
 
 
 class Torso(NamedTuple):
@@ -227,7 +229,7 @@ def _loose(
 
 def with_axes(values: Shaped[Tensor, "B *rest"], count: int) -> Tensor:
     """Return values with `count` axes of one element inserted after that of the batch."""
-    return values[(slice(None),) + (None,) * count]
+    return values.view(values.shape[0], *[1] * count, *values.shape[1:])
 
 
 def heavy_tail(squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

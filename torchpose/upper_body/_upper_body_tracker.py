@@ -229,13 +229,13 @@ class UpperBodyTracker(WideModule):
     @property
     def estimator(self) -> Estimator:
         """Return the estimator of the method, on prior, noise and options as they are now."""
-        return self._estimator_of(self.method)
+        return self._estimator_of(self.method, self.measurement_cov)
 
-    def _estimator_of(self, method: str, picked: Picked | None = None) -> Estimator:
+    def _estimator_of(self, method: str, cov: Tensor, picked: Picked | None = None) -> Estimator:
         """Return the estimator of a method for these keypoints; without `picked` for the prior's joints."""
         make: Callable[..., Estimator] = METHODS[method]
         model = TrackerModel(
-            self, self.prior, self.measurement_cov, self.fps, self.smoothing,
+            self, self.prior, cov, self.fps, self.smoothing,
             calibrated=self.calibrated, steadied=not self._unsteady,
             pitch=None if self.camera.up is None else angles_of_up(self.camera.up)[0],
         )  # fmt: skip
@@ -287,17 +287,18 @@ class UpperBodyTracker(WideModule):
             SkeletonError: unknown names.
         """
         refuse_export(*_NO_EXPORT)
-        with one_run(self.measurement_cov.device):
+        cov = self.measurement_cov
+        with one_run(cov.device):
             check_tensors(keypoints=keypoints)
-            keypoints = check_sequences(keypoints).to(self.measurement_cov)
+            keypoints = check_sequences(keypoints).to(cov)
             picked = self._pick(keypoints.shape[2], names)
             if lengths is not None:
                 lengths = as_lengths(lengths, *keypoints.shape[:2])
-            given = self._measure(keypoints, confidence, mask, covariance, absent, picked)
+            given = self._measure(keypoints, confidence, mask, covariance, absent, picked, cov)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             there = given.mask.flatten(0, 1).any(0).tolist()
-            reader = self._reader(there, picked)
-            _, found = screen_joints(self._screen(picked), None, given)
+            reader = self._reader(there, picked, cov)
+            _, found = screen_joints(self._screen(picked, cov), None, given)
             arms = generators_of_arms(generator)
             estimates = reader.estimator.forward(
                 found.measured, arm_joints(there), arms, lengths, progress
@@ -343,11 +344,12 @@ class UpperBodyTracker(WideModule):
         check_count("batch_size", batch_size)
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
-        with one_run(self.measurement_cov.device):
-            reader = self._reader(picked.there, picked)
+        cov = self.measurement_cov
+        with one_run(cov.device):
+            reader = self._reader(picked.there, picked, cov)
             joints, arms = arm_joints(picked.there), generators_of_arms(generator)
             state = reader.estimator.init(batch_size, joints, arms)
-        unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
+        unseen = torch.zeros(batch_size, dtype=torch.long, device=cov.device)
         return StreamState(state, None, unseen, n_keypoints, picked, method=reader.method)
 
     @uncompiled
@@ -423,12 +425,15 @@ class UpperBodyTracker(WideModule):
         check_shape("keypoints", keypoints, [len(state.unseen), "T", state.n_keypoints, 2])
         if keypoints.shape[1] == 0:
             raise InputError("keypoints must hold at least one frame, got none")
-        with one_run(self.measurement_cov.device):
-            keypoints = keypoints.to(self.measurement_cov)
-            given = self._measure(keypoints, confidence, mask, covariance, absent, state.picked)
-            reader = self._reader(state.picked.there, state.picked)
+        cov = self.measurement_cov
+        with one_run(cov.device):
+            keypoints = keypoints.to(cov)
+            given = self._measure(
+                keypoints, confidence, mask, covariance, absent, state.picked, cov
+            )
+            reader = self._reader(state.picked.there, state.picked, cov)
             check_stream_method(state, reader.method)
-            screen, found = screen_joints(self._screen(state.picked), state.screen, given)
+            screen, found = screen_joints(self._screen(state.picked, cov), state.screen, given)
             own, estimates = reader.estimator.advance(state.estimator, found.measured)
             motion, track = reader.read(state.motion, estimates, found)
         unseen = unseen_frames(state.unseen, found.measured.mask.any(-1))
@@ -452,11 +457,12 @@ class UpperBodyTracker(WideModule):
         covariance: Tensor | None,
         absent: Tensor | None,
         picked: Picked,
+        measurement_cov: Float[Tensor, "8 2 2"],
     ) -> MeasuredJoints:
         check_tensors(confidence=confidence, mask=mask, covariance=covariance, absent=absent)
         measured = in_prior_pixels(
             keypoints, confidence, mask, covariance, picked, self.prior, self.camera,
-            self.measurement_cov,
+            measurement_cov,
         )  # fmt: skip
         if absent is None:
             return measured
@@ -469,20 +475,21 @@ class UpperBodyTracker(WideModule):
         absence = absence_of(hands, self.camera, self.prior.info.matrix, turn)
         return measured._replace(absence=absence)
 
-    def _screen(self, picked: Picked) -> ScreenModel | None:
+    def _screen(self, picked: Picked, cov: Tensor) -> ScreenModel | None:
         """Return the model of the outlier screening; None if keypoints are taken as they are."""
-        given = (self.prior, self.camera, self.fps, picked, self.measurement_cov)
+        given = (self.prior, self.camera, self.fps, picked, cov)
         return kept_screen_model(self, *given) if self.outliers else None
 
-    def _reader(self, there: Sequence[bool], picked: Picked) -> PoseReader:
+    def _reader(self, there: Sequence[bool], picked: Picked, cov: Tensor) -> PoseReader:
         """Return the reader of poses, with the estimator of the method for these joints.
 
         Args:
             there: whether each of the eight joints is measured. picked: their places among the keypoints.
+            cov: `measurement_cov`.
         """
         method = self._chosen.with_joints(there, picked.wrists_for_hands)
-        estimator = self._estimator_of(method, picked)
-        stage, ratios, cov = None, estimator.steadied_by, self.measurement_cov
+        estimator = self._estimator_of(method, cov, picked)
+        stage, ratios = None, estimator.steadied_by
         if self.steady and ratios is not None:
             stage = kept_stage(self, ratios, self.fps or 30.0, cov)
         lag = stage_lag(self.smoothing, estimator.ahead)

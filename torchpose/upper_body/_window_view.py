@@ -78,7 +78,7 @@ def see_in_view(
         lengths: the number of frames of each sequence, [B]. start: the first frame that is wanted; may be
             negative.
     """
-    uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix.to(measured.uv)
+    uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix_like(measured.uv)
     if lengths is not None:
         frames = torch.arange(mask.shape[1], device=mask.device)
         mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
