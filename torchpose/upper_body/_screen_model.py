@@ -90,6 +90,7 @@ class ScreenModel(NamedTuple):
         exchanges: for each way to exchange left and right, the joints to take [X, 8]. exchanged: which
             joints these are another one for [X, 8].
         switching: the log-probability of each way after each other one [X, X].
+        cov, noise: R of each joint without any confidence [8, 2, 2], and its larger eigenvalue [8].
     """
 
     dt: float
@@ -115,6 +116,8 @@ class ScreenModel(NamedTuple):
     exchanges: Tensor
     exchanged: Tensor
     switching: Tensor
+    cov: Tensor
+    noise: Tensor
 
 
 def kept_screen_model(
@@ -123,24 +126,23 @@ def kept_screen_model(
     camera: PinholeCamera,
     fps: float | None,
     picked: Picked,
-    like: Tensor,
+    cov: Float[Tensor, "8 2 2"],
 ) -> ScreenModel:
     """Return `screen_model`, the same one as long as it holds.
 
     Args:
         owner: the module with which the model is kept. prior, camera, fps: those of the tracker.
-        picked: the places of the joints among the keypoints. like: a tensor on the device to work on.
+        picked: the places of the joints among the keypoints. cov: R of each joint without any confidence.
     """
     info, joints = prior.info, tuple(i >= 0 for i in picked.indices)
     joints = tuple(given or (picked.middle and i == _NECK) for i, given in enumerate(joints))
     mixtures = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple())
-    sources = (*mixtures, camera.matrix, camera.up)
-    wide = torch.zeros((), dtype=torch.float64, device=like.device)
+    sources = (*mixtures, camera.matrix, camera.up, cov)
     return derived(
         owner,
-        ("screen", info.fx, info.fy, info.cx, info.cy, camera.image_size, joints, fps, like.device),
+        ("screen", info.fx, info.fy, info.cx, info.cy, camera.image_size, joints, fps, cov.device),
         sources,
-        lambda: screen_model(prior, camera, fps or 30.0, joints, wide),
+        lambda: screen_model(prior, camera, fps or 30.0, joints, cov),
     )
 
 
@@ -149,7 +151,7 @@ def screen_model(
     camera: PinholeCamera,
     fps: float,
     joints: tuple[bool, ...],
-    like: Tensor,
+    cov: Float[Tensor, "8 2 2"],
 ) -> ScreenModel:
     """Return the model for keypoints of a camera.
 
@@ -157,8 +159,9 @@ def screen_model(
         prior: the prior, in whose pixels the model is. camera: the camera of the keypoints; without an image
             size the image is taken to be twice as wide and high as its principal point is far from the
             origin. fps: frames per second. joints: which of `UPPER_BODY` are among the keypoints.
-        like: a tensor of the dtype and on the device to work in.
+        cov: R of each joint without any confidence, on the device to work on.
     """
+    like = torch.zeros((), dtype=torch.float64, device=cov.device)
     corners = _corners(prior, camera, like)
     size, middle = (corners[1] - corners[0]).abs(), corners.mean(0)
     outlier = math.log(OUTLIERS / (1 - OUTLIERS)) - float((_ENLARGED * size).detach().log().sum())
@@ -182,8 +185,14 @@ def screen_model(
         (-(log_scales / _SCALE_SPREAD).square() / 2).log_softmax(0),
         math.exp(-dt / _SCALE_MEMORY), places, (sizes * spread).square(), subsets,
         torch.cat([subsets, 1 - subsets], 1), exchanges, exchanges != exchanges[0],
-        _switching(len(exchanges)).to(like),
+        _switching(len(exchanges)).to(like), cov, largest_variance(cov.to(like)),
     )  # fmt: skip
+
+
+def largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
+    """Return the larger eigenvalue of each covariance."""
+    a, b, c, d = cov.flatten(-2).unbind(-1)
+    return (a + d) / 2 + (((a - d) / 2).square() + b * c).clamp_min(0.0).sqrt()
 
 
 def _corners(prior: UpperBodyPrior, camera: PinholeCamera, like: Tensor) -> Float[Tensor, "2 2"]:

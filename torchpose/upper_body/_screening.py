@@ -23,6 +23,7 @@ from torchpose.upper_body._screen_model import (
     SLACK,
     TAKEOVER,
     ScreenModel,
+    largest_variance,
 )
 from torchpose.upper_body._screen_tracks import (
     DOUBTFUL,
@@ -112,13 +113,16 @@ def _run(
 ) -> tuple[ScreenState, Float[Tensor, "B T 8"], Int[Tensor, "B T"], Float[Tensor, "B T"]]:
     """Return the next state, and of each frame inlier probabilities, the way of exchange, and R's factor."""
     uv = measured.uv.to(model.low)
-    known = measured.mask & ((uv >= model.low) & (uv <= model.high)).all(-1)
-    noise = _largest_variance(measured.cov.to(model.low)).expand(known.shape)
-    ways = model.exchanges
-    frames = (uv[:, :, ways], known[:, :, ways], noise[:, :, ways], _doubt(measured)[:, :, ways])
+    known = measured.mask & (uv.clamp(model.low, model.high) == uv).all(-1)
+    usual = measured.cov is model.cov
+    noise = model.noise if usual else largest_variance(measured.cov.to(model.low))
+    noise, ways, doubts = noise.expand(known.shape), model.exchanges, _doubt(measured)
+    frames = (uv[:, :, ways], known[:, :, ways], noise[:, :, ways])
+    doubts = None if doubts is None else doubts[:, :, ways]
     probabilities, factors, chosen = [], [], torch.zeros_like(known[..., 0], dtype=torch.long)
     for t in range(uv.shape[1]):
-        z, there, variance, doubt = (x[:, t] for x in frames)
+        z, there, variance = (x[:, t] for x in frames)
+        doubt = None if doubts is None else doubts[:, t]
         level, scale = state.level, _scale(model, state)
         factors.append(level.factor)
         variance = factors[-1][:, None, None] * variance
@@ -139,7 +143,7 @@ def _step(
     uv: Float[Tensor, "B X 8 2"],
     known: Bool[Tensor, "B X 8"],
     noise: Float[Tensor, "B X 8"],
-    doubt: Float[Tensor, "B X 8"],
+    doubt: Float[Tensor, "B X 8"] | None,
 ) -> tuple[ScreenState, Float[Tensor, "B 8"], Int[Tensor, " B"] | None]:
     """Return the next state, the inlier probabilities of a frame, and the way of exchange; None is 0."""
     square = scale.square()[:, None, None]
@@ -175,20 +179,21 @@ def _log_odds(
     uv: Float[Tensor, "B X 8 2"],
     known: Bool[Tensor, "B X 8"],
     noise: Float[Tensor, "B X 8"],
-    doubt: Float[Tensor, "B X 8"],
+    doubt: Float[Tensor, "B X 8"] | None,
     jump: Float[Tensor, "B 1 1 8"],
 ) -> _Odds:
     """Return log ((1 - o) f(z) / (o u)) of tracks and candidates for each way of exchange, [B, 2, X, 8].
 
     It is 0 where nothing is measured; see `advance_screen`.
     """
-    half = (uv[:, None] - state.position[:, :, None]).square().sum(-1) / 2
+    apart = (uv[:, None] - state.position[:, :, None]).square().sum(-1)
     calm = state.cov[:, :, None, :, 0] + noise[:, None]
     variance = torch.stack([calm, calm + jump], -1)
-    densities = model.start - variance.log() - half[..., None] / variance
+    logs = model.start - variance.log()
+    densities = torch.addcdiv(logs, apart[..., None], variance, value=-0.5)
     usual, brisk = densities.unbind(-1)
     either, known = torch.logaddexp(usual, brisk), known[:, None]
-    total = either - doubt[:, None]
+    total = either if doubt is None else either - doubt[:, None]
     return _Odds(total * known, (brisk - either).exp() * (known & (total > 0)))
 
 
@@ -258,7 +263,7 @@ def _beside_others(
     misfit = (square - pull.square() / total.clamp_min(1e-12)).sum(-1)
     count = (linear(known.to(z), model.subsets) - 1).clamp_min(0.0)
     weights = linear(odds, model.subsets)[:, None] - 2 * count[:, None] * model.log_scales[:, None]
-    weights = scales[..., None] + weights - misfit / 2
+    weights = (scales[..., None] + weights).sub(misfit, alpha=0.5)
     of_scales = weights.logsumexp(-1, keepdim=True)
     share = (weights - of_scales.amax(1, keepdim=True)).exp().sum(1)
     tiny = torch.finfo(share.dtype).tiny
@@ -267,21 +272,15 @@ def _beside_others(
     return body, model.usual.lerp(of_scales[..., 0], model.memory).log_softmax(-1)
 
 
-def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"]:
-    """Return the reduction of the log-odds of an inlier by a low confidence c of the detector.
+def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"] | None:
+    """Return the reduction of the log-odds of an inlier by a low confidence c of the detector, or None.
 
     The log-odds are those of the share of outliers, but at most (c - 0.25) / 0.06.
     """
     if measured.confidence is None:
-        return torch.zeros_like(measured.uv[..., 0])
+        return None
     usual = math.log((1 - OUTLIERS) / OUTLIERS)
     return (usual - (measured.confidence - _EVEN) / _STEEP).clamp_min(0.0)
-
-
-def _largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
-    """Return the larger eigenvalue of each covariance."""
-    a, b, c, d = cov.flatten(-2).unbind(-1)
-    return (a + d) / 2 + (((a - d) / 2).square() + b * c).clamp_min(0.0).sqrt()
 
 
 def _noisier(measured: MeasuredJoints, factor: Float[Tensor, "B T"]) -> MeasuredJoints:
