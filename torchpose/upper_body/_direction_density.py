@@ -49,10 +49,10 @@ class DirectionDensity:
         alone = torch.arange(dim + 1, device=device)
         self._first = torch.cat([first, alone])
         self._second = torch.cat([second, torch.full_like(alone, dim)])
-        slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
         log_broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
         self._broad, self._nothing = math.exp(log_broad), (log_broad + _NOTHING) / _LOG_2
-        self._slopes = pad(slopes, (0, 1))
+        slopes = torch.cat([squares, pulled, constant[:, None]], 1)
+        self._slopes = pad(slopes, (0, 0, 0, 1))
         self._slopes[-1, -1] = log_broad
         self._slopes /= _LOG_2
         by_bone = _by_bone(-0.5 * precision, pulled, constant)
@@ -66,14 +66,15 @@ class DirectionDensity:
 
     def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
         """Return log p(d_u, d_f)."""
-        ones = self._ones.new_ones(len(self._ones) + 1)
-        parts = [self._densities(rows) @ ones for rows in directions.flatten(0, -2).split(_ROWS)]
+        rows = directions.flatten(0, -2).split(2 * _ROWS)
+        parts = [self._densities(part).sum(0) for part in rows]
         return torch.cat(parts).log().to(directions.dtype).view(directions.shape[:-1])
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
-        densities = self._densities(directions)
-        return (densities / densities.sum(-1, keepdim=True)).to(directions.dtype)
+        densities = self._densities(directions.flatten(0, -2))
+        shares = (densities / densities.sum(0)).to(directions.dtype)
+        return shares.mT.reshape(*directions.shape[:-1], -1)
 
     def of_arms(
         self,
@@ -121,15 +122,14 @@ class DirectionDensity:
         densities = self._powers(products @ of_pairs.flatten(1))
         return densities.view(len(products), -1, slopes.shape[-1]) @ self._ones
 
-    def _densities(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
+    def _densities(self, directions: Float[Tensor, "N 6"]) -> Float[Tensor, "K N"]:
         """Return the densities of the components, the broad one last.
 
         The terms of their logarithms cancel, some of a thousand to a few: they are float64.
         """
-        rows = directions.reshape(-1, 6)
-        columns = pad(rows.double(), (0, 1), value=1.0).mT.contiguous()
+        columns = pad(directions.double(), (0, 1), value=1.0).mT.contiguous()
         terms = columns.index_select(0, self._first) * columns.index_select(0, self._second)
-        return self._powers(terms.mT @ self._slopes).view(*directions.shape[:-1], -1)
+        return self._powers(self._slopes @ terms)
 
     def _powers(self, logs: Tensor) -> Tensor:
         """Return two to the power of numbers, in place."""
