@@ -45,9 +45,10 @@ def _euler_terms(order: RotationOrder) -> tuple[Float[Tensor, "3 S"], Float[Tens
     cos a = (e^ia + e^-ia) / 2 and sin a = (e^ia - e^-ia) / 2i, of which those of a sum and of its negative
     are conjugates.
     """
-    entries = [sum(map(_exponentials, products)) for products in _EULER[order]]
+    entries = [torch.stack([*map(_exponentials, products)]).sum(0) for products in _EULER[order]]
     coefficients = torch.stack(entries).flatten(1)  # [9, 27], of the sums with factors -1, 0 and 1
     factors = torch.cartesian_prod(*[torch.arange(-1.0, 2.0, dtype=torch.float64)] * 3)
+    # of a sum and its negative the second half has one; rows that no entry needs are left out
     used = [row for row in range(14, 27) if bool((coefficients[:, row] != 0).any())]
     known = 2 * coefficients[:, used].mT
     return factors[used].mT.contiguous(), torch.cat([known.real, -known.imag])
