@@ -246,7 +246,23 @@ class PinholeCamera(NoHalfModule):
         check_choice("axis", axis, ("y", "z"))
         return self._with_up(self.rotation_matrix[:, "xyz".index(axis)].tolist())
 
-    def _with_up(self, up: Sequence[float]) -> Self:
+    def in_level_world(self) -> Self:
+        """Return the camera in a world of its own, whose y axis points up as `up` says.
+
+        The origin is in the lens, z points towards the viewer, horizontally, and x to the right. Without `up`
+        the camera is taken to be level.
+
+        >>> camera = PinholeCamera(525, 525, 319.5, 239.5).tilted(0.2).in_level_world()
+        >>> torch.allclose(camera.rotation_matrix[:, 1], camera.up)
+        True
+        """
+        camera = self._with_up(None if self.up is None else self.up.tolist())
+        flip = torch.tensor([1.0, -1.0, -1.0]).to(self.matrix)
+        camera.rotation = matrix_to_rotvec(self.level_rotation.mT * flip)
+        camera.translation = torch.zeros_like(self.translation)
+        return camera
+
+    def _with_up(self, up: Sequence[float] | None) -> Self:
         fx, fy, skew, cx, cy = (float(e) for e in intrinsics(self.matrix))
         return type(self)(
             fx, fy, cx, cy, self.width, self.height, self.name, skew=skew,

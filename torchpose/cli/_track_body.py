@@ -32,7 +32,7 @@ from torchpose.cli._track_body_output import (
     write_page,
     write_people,
 )
-from torchpose.cli._uncalibrated import camera_without_file, needs_no_file
+from torchpose.cli._uncalibrated import camera_without_file, needs_no_file, told_tilt
 from torchpose.errors import CameraError, InputError, NobodySeenError
 
 if TYPE_CHECKING:
@@ -121,6 +121,8 @@ def run(
     seed: int = 0,
     formats: list[str] | None = None,
     up: Literal["y", "z"] | None = None,
+    tilt: float | None = None,
+    roll: float | None = None,
     overlay: bool = True,
     pictures: bool = True,
     given: Given,
@@ -171,6 +173,9 @@ def run(
         formats: also write the poses as body.trc, body.c3d or body.bvh.
         up: the axis of the cameras' world that points up: kalman expects people upright along it, and the
             files of --formats have y up. By default they have the axes of the world.
+        tilt: degrees by which a camera without a file looks up, negative if down. Without it, the tilt is found
+            by how people stand.
+        roll: degrees by which a camera without a file is rolled clockwise, as seen from behind it.
         overlay: write a video per camera with the body drawn into it.
         pictures: write overlay.png, and for keypoints skeleton.png.
         given: the command.
@@ -184,7 +189,11 @@ def run(
     check_values(given.values)
     refuse_unsuited(given, by_keypoints)
     share_cores()
-    found, notes = _cameras(cameras, camera_names, inputs, videos)
+    found, notes = _cameras(cameras, camera_names, inputs, videos, tilt, roll)
+    finds_tilt = False
+    if needs_no_file(cameras):
+        finds_tilt = not by_particles(method) and tilt is None and roll is None and up is None
+        notes += (told_tilt(tilt, roll, up),) * (not finds_tilt)
     if camera_names is None:
         check_numbers(inputs, [camera.name for camera in found])
     job = BodyJob(
@@ -196,7 +205,8 @@ def run(
     if not by_keypoints or by_particles(method):
         tracker |= _models(method, tracker, options, initial_pose)
     if by_keypoints:
-        return _run_on_keypoints(job, inputs, found, given.values, {**tracker, **options})
+        options = {**tracker, **options}
+        return _run_on_keypoints(job, inputs, found, given.values, options, finds_tilt)
     with ExitStack() as stack:
         drawn = ["overlay.png"] if job.pictures else []
         results = stack.enter_context(body_results(job, found, overlay, drawn))
@@ -231,6 +241,7 @@ def _run_on_keypoints(
     cameras: "list[PinholeCamera]",
     values: dict[str, Any],
     tracker: dict[str, Any],
+    finds_tilt: bool,
 ) -> int:
     """Track by keypoints, and return the exit code."""
     from torchpose.cli._body_keypoint_inputs import DetectorSettings
@@ -242,14 +253,15 @@ def _run_on_keypoints(
     arguments = tracker
     if not by_particles(values["method"]):
         names = ("body", "height", "keypoint_std", "pixel_std", "motion", "camera_height")
-        arguments = {**{name: tracker[name] for name in names}, "up": values["up"]}
+        told = values["tilt"] is not None or values["roll"] is not None
+        arguments = {**{name: tracker[name] for name in names}, "up": "y" if told else values["up"]}
     outlines = None
     if values["silhouettes"]:
         outlines = SilhouetteSettings(values["rows"], values["background"], values["ignore_still"])
     settings = KeypointSettings(
         detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments,
         values["refine"], values["persons"], values["method"] or KALMAN,
-        values["initial_pose"], values["seed"], outlines,
+        values["initial_pose"], values["seed"], outlines, needs_no_file(values["cameras"]), finds_tilt,
     )  # fmt: skip
     return track_keypoints(job, inputs, cameras, settings)
 
@@ -280,14 +292,19 @@ def _facts(
 
 
 def _cameras(
-    file: str, names: list[str] | None, inputs: list[str], videos: list[str] | None
+    file: str,
+    names: list[str] | None,
+    inputs: list[str],
+    videos: list[str] | None,
+    tilt: float | None,
+    roll: float | None,
 ) -> "tuple[list[PinholeCamera], tuple[str, ...]]":
     """Return the cameras of the inputs, and notes on the file, or on what is assumed without one."""
     from torchpose.camera._pinhole import camera_of_name, list_names, read_cameras
 
     n_inputs = len(inputs)
     if needs_no_file(file):
-        camera, assumed = camera_without_file(file, inputs, videos)
+        camera, assumed = camera_without_file(file, inputs, videos, tilt, roll)
         return [camera], assumed
     cameras, notes = read_cameras(file)
     names = list(cameras) if names is None else names

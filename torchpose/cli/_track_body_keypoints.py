@@ -35,6 +35,7 @@ from torchpose.cli._track_body_output import (
     write_people,
 )
 from torchpose.cli._track_output import percent, person_suffix, smoothing_text
+from torchpose.cli._uncalibrated import tilt_of
 from torchpose.errors import NobodySeenError
 
 if TYPE_CHECKING:
@@ -46,7 +47,8 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_track import BodyTrack
     from torchpose.whole_body._body_tracker import BodyTracker
 
-_CAMERAS = "refined_cameras.toml"
+_CAMERAS, _CAMERA = "refined_cameras.toml", "camera.toml"
+_TILT_SECONDS = 60.0  # of the beginning, in which people tell how the camera is held
 _AGREES = 0.5  # share of the keypoints of a camera in a frame, above which it agrees with the body
 _DISAGREE = (
     "no two cameras agree on where the person is in more than half of the frames, so the poses are not to be "
@@ -66,6 +68,8 @@ class KeypointSettings(NamedTuple):
         persons: "all", or how many there are at most at a time; None for the one who is followed.
         method: of tracking. initial_pose, seed: of particle filters, as of the command.
         silhouettes: how the videos become some, which count beside the keypoints; None for none.
+        without_file: whether the camera has no file, so that one is written. finds_tilt: whether it is to be
+            found how it is held.
     """
 
     detector: DetectorSettings | None
@@ -80,6 +84,8 @@ class KeypointSettings(NamedTuple):
     initial_pose: str | None = None
     seed: int = 0
     silhouettes: SilhouetteSettings | None = None
+    without_file: bool = False
+    finds_tilt: bool = False
 
 
 def track_keypoints(
@@ -113,6 +119,9 @@ def track_keypoints(
         )  # fmt: skip
         recordings = stack.enter_context(_recordings(shown, cameras, keypoints.fps, settings))
         start = time.perf_counter()
+        if settings.finds_tilt:
+            keypoints, settings = _with_tilt(keypoints, settings)
+            cameras = keypoints.cameras
         people = _track(keypoints, settings, recordings)
         seconds = time.perf_counter() - start
         if not people:
@@ -165,17 +174,38 @@ def _nobody(keypoints: BodyKeypoints) -> str:
 def _more(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
     """Return the names of further files: pictures, cameras."""
     pictures = [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
-    return pictures + [_CAMERAS] * (settings.refine != "none")
+    return pictures + [_CAMERAS] * (settings.refine != "none") + [_CAMERA] * settings.without_file
+
+
+def _with_tilt(
+    keypoints: BodyKeypoints, settings: KeypointSettings
+) -> tuple[BodyKeypoints, KeypointSettings]:
+    """Return keypoints in a camera that is held as people in the first minute show, and settings for it."""
+    n = round(_TILT_SECONDS * keypoints.fps)
+    begun = keypoints._replace(points=keypoints.points[:n], confidence=keypoints.confidence[:n])
+    people = _track(begun, settings._replace(smoothing="none"))
+    camera, note = tilt_of(people, keypoints.cameras[0])
+    keypoints = keypoints._replace(notes=(*keypoints.notes, note))
+    if camera is None:
+        return keypoints, settings
+    tracker = {**settings.tracker, "up": "y"}
+    return keypoints._replace(cameras=[camera]), settings._replace(tracker=tracker)
 
 
 def _refined(
     keypoints: BodyKeypoints, settings: KeypointSettings, poses: "BodyTrack", stage: "Path"
 ) -> tuple[BodyKeypoints, "list[Path]"]:
-    """Return keypoints with the refined cameras, and the file of these; both as given without --refine."""
-    if settings.refine == "none":
-        return keypoints, []
+    """Return keypoints with the refined cameras, and the file of these; both as given without --refine.
+
+    A camera that has no file gets one too.
+    """
     from torchpose.camera._pinhole import save_cameras
 
+    if settings.without_file:
+        save_cameras(keypoints.cameras, stage / _CAMERA)
+        return keypoints, [stage / _CAMERA]
+    if settings.refine == "none":
+        return keypoints, []
     rotations = poses.details["camera_rotation"][0]
     translations = poses.details["camera_translation"][0]
     cameras = [copy.deepcopy(camera) for camera in keypoints.cameras]

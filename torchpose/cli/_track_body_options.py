@@ -128,6 +128,11 @@ def refuse_unsuited(given: Given, by_keypoints: bool) -> None:
         )
     if needs_no_file(given.values["cameras"]):
         _check_without_file(given, by_keypoints)
+    else:
+        given.refuse(
+            ("tilt", "roll"),
+            "a camera without a file; the rotation in the file and --up tell how a camera is held",
+        )
     if not by_keypoints:
         given.refuse(_OF_KEYPOINTS, "keypoints, and the inputs are videos without --detector")
     else:
@@ -154,6 +159,9 @@ def _check_without_file(given: Given, by_keypoints: bool) -> None:
             "--detector finds keypoints in videos"
         )
     given.refuse(("camera_names",), f"camera files, and {cameras} stands for one camera")
+    told = given.values["tilt"] is not None or given.values["roll"] is not None
+    if told and given.values["up"] is not None:
+        raise InputError("--tilt and --roll tell which way is up; leave --up out, or them")
 
 
 def _refuse_beside_keypoints(given: Given, method: str | None) -> None:

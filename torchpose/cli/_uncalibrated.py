@@ -1,4 +1,7 @@
-"""The camera of `torchpose track-body` without a camera file: of four numbers, or guessed."""
+"""The camera of `torchpose track-body` without a camera file: of four numbers, or guessed.
+
+Its world has y up. Which way that is is stated, or found by how people stand.
+"""
 
 import math
 from collections.abc import Sequence
@@ -12,12 +15,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.whole_body._body_track import BodyTrack
 
 _UNCALIBRATED = "uncalibrated"
 _NAME = "camera"
-_AXES = (
-    "the camera has no pose: the axes of the world are its own, x right, y up, z towards the viewer, "
-    "with the origin in the lens; it is taken to be about level"
+_AXES = "the axes of the world are x right, y up, z towards the viewer, with the origin in the lens"
+_LEVEL = (
+    f"the camera has no pose: {_AXES}; it is taken to be about level (--tilt and --roll say otherwise)"
 )
 
 
@@ -27,20 +31,25 @@ def needs_no_file(cameras: str) -> bool:
 
 
 def camera_without_file(
-    text: str, inputs: Sequence[str], videos: Sequence[str] | None
+    text: str,
+    inputs: Sequence[str],
+    videos: Sequence[str] | None,
+    tilt: float | None = None,
+    roll: float | None = None,
 ) -> "tuple[PinholeCamera, tuple[str, ...]]":
-    """Return the camera of one input, about level, and notes on what is assumed.
+    """Return the camera of one input, in a world whose y axis points up, and notes on what is assumed.
 
     Args:
         text: ``fx,fy,cx,cy`` in pixels, or "uncalibrated" for K of the input, else the usual focal length for
             the size of its images.
         inputs: keypoints or videos. videos: into which the body is drawn, if some were given.
+        tilt: degrees by which the camera looks up. roll: degrees by which it is rolled clockwise.
 
     Raises:
         InputError: several inputs, which need a camera file.
         CameraError: the size of the images is not known, or numbers that no camera has.
     """
-    from torchpose.camera._choice import resolve_camera
+    from torchpose.camera._choice import held_camera, resolve_camera
 
     if len(inputs) != 1:
         raise InputError(
@@ -56,8 +65,43 @@ def camera_without_file(
         )
     camera, notes = resolve_camera(given, None, size, matrix, inputs[0])
     camera.name = _NAME
-    camera.rotation[0] = math.pi  # y of a level camera points down, that of the world up
-    return camera, (*notes, _AXES)
+    return held_camera(camera, tilt, roll, None, given).in_level_world(), notes
+
+
+def told_tilt(tilt: float | None, roll: float | None, up: str | None) -> str:
+    """Return the note on the world of a camera whose tilt is not looked for."""
+    if tilt is None and roll is None:
+        level = "it is level, as --up says" if up else "it is taken to be about level"
+        return f"the camera has no pose: {_AXES}; {level}"
+    return f"the camera {_angles(tilt or 0.0, roll or 0.0)}: {_AXES}"
+
+
+def tilt_of(
+    people: "Sequence[BodyTrack]", camera: "PinholeCamera"
+) -> "tuple[PinholeCamera | None, str]":
+    """Return the camera with the tilt that people show, None if they show none, and a note on it.
+
+    Args:
+        people: tracked in the camera, taken to be level. camera: in which they were.
+    """
+    from torchpose.whole_body._keypoints.camera_tilt import find_camera_tilt
+
+    found = find_camera_tilt(people, camera) if people else None
+    if found is None:
+        return None, f"{_LEVEL}: nobody was seen to stand for half a second"
+    pitch, roll, *stds = map(math.degrees, found)
+    note = f"{_angles(pitch, roll, stds)}, by how people stand (--tilt and --roll say otherwise)"
+    return camera.tilted(found.pitch, found.roll).in_level_world(), f"the camera {note}: {_AXES}"
+
+
+def _angles(tilt: float, roll: float, stds: Sequence[float] = ()) -> str:
+    """Return how a camera is held, by degrees and their standard deviations, if there are some."""
+    off = [f" ± {std:.0f}" for std in stds] or ["", ""]
+    up, clockwise = (f"{abs(angle):.0f}" if stds else f"{abs(angle):g}" for angle in (tilt, roll))
+    return (
+        f"looks {'down' if tilt < 0 else 'up'} by {up}{off[0]} degrees and is rolled by {clockwise}{off[1]} "
+        f"{'counterclockwise' if roll < 0 else 'clockwise'}"
+    )
 
 
 def _images_of(

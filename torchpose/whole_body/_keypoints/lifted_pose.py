@@ -37,6 +37,7 @@ from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalman
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.known_person import length_of_legs, weights_of_legs
+from torchpose.whole_body._keypoints.lifted_lean import without_lean
 from torchpose.whole_body._keypoints.lifting_network import (
     MEMORY,
     Lifted,
@@ -82,11 +83,15 @@ class LifterMemory(NamedTuple):
 
 
 class _UprightView(NamedTuple):
-    """Holds maps from homogeneous pixels to rays [C, 3, 3], and the poses of cameras turned upright."""
+    """Holds maps from homogeneous pixels to rays [C, 3, 3], and the poses of cameras turned upright.
+
+    `up` is the direction that points up in their axes, [C, 3], None where the cameras are taken to be level.
+    """
 
     to_rays: Tensor
     rotation: Tensor
     translation: Tensor
+    up: Tensor | None
 
     @classmethod
     def of(cls, rig: CameraRig, up: str | None) -> Self:
@@ -94,7 +99,9 @@ class _UprightView(NamedTuple):
         upright = upright_of(rig, up) or camera_up(rig)
         roll = torch.stack([_upright_roll(axes @ upright.direction) for axes in rig.rotation])
         place = (roll @ rig.translation[..., None]).squeeze(-1)
-        return cls(roll @ torch.linalg.inv(rig.matrix), roll @ rig.rotation, place)
+        rotation = roll @ rig.rotation
+        known = None if up is None else rotation @ upright.direction
+        return cls(roll @ torch.linalg.inv(rig.matrix), rotation, place, known)
 
 
 class PoseLifter(nn.Module):
@@ -102,8 +109,8 @@ class PoseLifter(nn.Module):
 
     Args:
         rig: of cameras side by side. fps: frames per second. motion: of the person, whose legs tell the size.
-        up: "y" or "z", the axis of the world that points up, by which the image is turned upright; without
-            it the camera is taken to be level.
+        up: "y" or "z", the axis of the world that points up, by which the image and lifted bodies are turned
+            upright; without it the camera is taken to be level.
     """
 
     def __init__(
@@ -147,6 +154,7 @@ class PoseLifter(nn.Module):
         flat = mapped(lambda value: value.flatten(0, 1), (rays, sure, memory))
         each = mapped(lambda value: value.unflatten(0, sure.shape[:2]), self._by_camera(*flat))
         (joints, std), memory = each
+        joints = self._without_lean(joints, rays, sure, memory.roll)
         enough = ((sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS).to(rays)
         share = enough / enough.sum(1, keepdim=True).clamp_min(1)
         mean = (share[..., None] * (joints @ self.view.rotation)).sum(1)
@@ -164,6 +172,22 @@ class PoseLifter(nn.Module):
         lifted, after = self.network(seen[:, None], before)
         joints, std = (self.size * value[:, 0].to(rays) for value in lifted)
         return Lifted(joints @ roll.turn, std), LifterMemory(after, roll)
+
+    def _without_lean(
+        self,
+        joints: Float[Tensor, "B C J 3"],
+        rays: Float[Tensor, "B C J 3"],
+        sure: Float[Tensor, "B C J"],
+        roll: BodyRoll,
+    ) -> Float[Tensor, "B C J 3"]:
+        """Return lifted joints turned upright where it is known which way is up and bodies do not lie."""
+        up = self.view.up
+        if up is None:
+            return joints
+        known = rays[..., :2].masked_fill(~(sure > 0)[..., None], torch.nan)
+        middle = known.nanmedian(-2).values.nan_to_num()
+        level = (roll.up == BodyRoll.upright(sure[..., 0]).up).all(-1)
+        return torch.where(level[..., None, None], without_lean(joints, middle, up), joints)
 
     def placed(self, lifted: Lifted, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
         """Return lifted joints in the world, where they lie near the rays of the camera that sees most.
