@@ -13,14 +13,15 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR --sitting [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --lying [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --desk
+    python -m benchmarks.keypoint_bodies --data DIR --uncalibrated [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
 
 The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
 is. The fourth shows people who sit to one camera, the fifth people who lie. The sixth shows people whose
-hips and legs are hidden to two cameras. The seventh prints what the constants of the filters of single
-joints were chosen by. The eighth fits the network that comes with torchpose and lifts the keypoints of one
-camera.
+hips and legs are hidden to two cameras. The seventh tilts a camera that nobody calibrated. The eighth prints
+what the constants of the filters of single joints were chosen by. The ninth fits the network that comes with
+torchpose and lifts the keypoints of one camera.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, OURS, Method, m
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.sitting import add_sitting_table
 from benchmarks.keypoint_bodies.tables import add_table
+from benchmarks.keypoint_bodies.tilts import add_tilt_tables
 from torchpose.evaluation import Report
 
 _ALL = (*METHODS, *LIFTERS)
@@ -76,6 +78,7 @@ def main(
     sitting: bool = False,
     lying: bool = False,
     desk: bool = False,
+    uncalibrated: bool = False,
     choose: bool = False,
     fit: Path | None = None,
     quick: bool = False,
@@ -93,6 +96,8 @@ def main(
         sitting: whether people sit, seen by one camera, in place of the tables.
         lying: whether people lie, seen by one camera, in place of the tables.
         desk: whether hips and legs are hidden to two cameras, in place of the tables; of methods `OURS`.
+        uncalibrated: whether one camera is tilted and nobody has calibrated it, in place of the tables; with
+            the lifters of methods beside the filter.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
         quick: few and short clips, to see that it works.
@@ -105,6 +110,11 @@ def main(
     if desk:
         ours = [name for name in methods if name in OURS]
         add_desk_table(report, methods_of(ours, data, None, quick), data, quick)
+        print_tables(report, out)
+        return
+    if uncalibrated:
+        lifting = [name for name in methods if name in LIFTERS]
+        add_tilt_tables(report, methods_of(lifting, data, lifters, quick), data, quick)
         print_tables(report, out)
         return
     names = CHOOSING if choose else SCORED

@@ -40,8 +40,8 @@ from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_
 
 __all__ = ["add_tilt_tables"]
 
-_FPS, _FRAMES, _QUICK_FRAMES = 30.0, 60, 20
-_EVERY, _KINECT_EVERY = 3, 3  # recordings of each group
+_FPS, _FRAMES, _QUICK_FRAMES = 30.0, 45, 20
+_EVERY, _KINECT_EVERY = 4, 4  # recordings of each group
 _WIDTH, _HEIGHT = 1080, 1920
 _DISTANCE, _LENS, _AROUND, _NEAREST, _AIM = (3.0, 5.0), (0.8, 1.6), math.radians(60.0), 2.0, 0.95
 _PELVIS = BODY_15.joint("pelvis")
@@ -67,11 +67,9 @@ class _View(NamedTuple):
 
 _VIEWS = {
     "level": _View(),
-    "5 down": _View(-5.0),
     "10 down": _View(-10.0),
     "20 down": _View(-20.0),
     "30 down": _View(-30.0),
-    "5 up": _View(5.0),
     "10 up": _View(10.0),
     "20 up": _View(20.0),
     "rolled 10": _View(roll=10.0),
@@ -173,7 +171,9 @@ def _seen(name: str, joints: Float[Tensor, "T 15 3"], view: _View) -> _Seen:
         height = _AIM - distance * math.tan(math.radians(view.pitch))
     camera = PinholeCamera.from_image_size(_WIDTH, _HEIGHT)
     camera = camera.tilted(math.radians(view.pitch), math.radians(view.roll)).in_level_world()
-    heading = torch.stack([torch.linalg.cross(_UP, ray), _UP, ray])  # x right, y up, z to the viewer
+    heading = torch.stack(
+        [torch.linalg.cross(_UP, ray), _UP, ray]
+    )  # x right, y up, z to the viewer
     level = (joints - foot - distance * ray - height * _UP) @ heading.T
     local = level @ camera.rotation_matrix.T
     matrix = camera.matrix.clone()
@@ -198,7 +198,10 @@ def _errors(
         _found(*given, level) for given in zip(people, unknown, angles, strict=True)
     ]
     scores = {
-        name: [_scores(_joints(track), camera, one) for (track, camera), one in zip(tracks, people, strict=True)]
+        name: [
+            _scores(_joints(track), camera, one)
+            for (track, camera), one in zip(tracks, people, strict=True)
+        ]
         for name, tracks in rows.items()
     }
     for name, method in lifters.items():
@@ -210,7 +213,9 @@ def _errors(
     return {name: torch.tensor(found).nanmean(0) for name, found in scores.items()}, angles
 
 
-def _tracked(people: Sequence[_Seen], camera: PinholeCamera, up: str | None = None) -> list[BodyTrack]:
+def _tracked(
+    people: Sequence[_Seen], camera: PinholeCamera, up: str | None = None
+) -> list[BodyTrack]:
     """Return the tracks of people whom one camera is taken to see."""
     longest = max(len(one.joints) for one in people)
 
@@ -270,4 +275,9 @@ def _of_angles(angles: Sequence[CameraTilt | None], view: _View) -> list[float]:
     found = torch.tensor([angle for angle in angles if angle is not None]).reshape(-1, 4).rad2deg()
     pitch, roll = found[:, 0] - view.pitch, found[:, 1] - view.roll
     inside = 100 * (pitch.abs() < 1.645 * found[:, 2]).double().mean()
-    return [len(found), float(pitch.square().mean().sqrt()), float(inside), float(roll.square().mean().sqrt())]
+    return [
+        len(found),
+        float(pitch.square().mean().sqrt()),
+        float(inside),
+        float(roll.square().mean().sqrt()),
+    ]

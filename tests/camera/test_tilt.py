@@ -40,6 +40,19 @@ def test_level_axes_have_gravity_downwards_and_the_heading_of_the_camera(pitch, 
     assert angles_of_up(camera.up) == pytest.approx((pitch, roll))
 
 
+@pytest.mark.parametrize(("pitch", "roll"), ANGLES)
+def test_the_level_world_of_a_camera_has_y_up_and_its_heading(pitch, roll):
+    camera = CAMERA.tilted(pitch, roll).in_level_world()
+    rotation = camera.rotation_matrix
+    torch.testing.assert_close(rotation[:, 1], camera.up)
+    ahead = rotation[2]  # the optical axis in the world: no component to the right
+    torch.testing.assert_close(ahead, ahead.new_tensor([0, math.sin(pitch), -math.cos(pitch)]))
+    torch.testing.assert_close(camera.with_world_up("y").up, camera.up)
+    assert not bool(camera.translation.any())
+    level = CAMERA.in_level_world()
+    torch.testing.assert_close(level.rotation_matrix, torch.diag(EYE.new_tensor([1.0, -1, -1])))
+
+
 def test_a_camera_that_is_rolled_clockwise_sees_the_sky_on_its_left():
     assert CAMERA.tilted(0.0, math.pi / 2).up.tolist() == pytest.approx([-1, 0, 0])
     assert CAMERA.tilted(0.3).up.tolist() == pytest.approx([0, -math.cos(0.3), math.sin(0.3)])

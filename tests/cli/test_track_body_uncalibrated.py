@@ -1,5 +1,7 @@
 """`torchpose track-body` in one camera without a camera file."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from torchpose.video import VideoWriter
 from torchpose.whole_body import BodyTrack
 
 PLAIN = ("--height", 1.75, "--pictures", "false", "--overlay", "false")
-AXES = "the axes of the world are its own, x right, y up"
+AXES = "the axes of the world are x right, y up"
 HEAD, PELVIS, ANKLE = (BODY_15.joint(name) for name in ("head", "pelvis", "left_ankle"))
 
 
@@ -35,6 +37,8 @@ def scene(tmp_path_factory):
     pixels = camera(joints)[..., :2]
     write_keypoints(folder / "seen.npz", keypoints_of(pixels))
     write_keypoints(folder / "known.npz", keypoints_of(pixels, K=camera.matrix))
+    tilted = level_camera().tilted(math.radians(-12.0), math.radians(8.0)).in_level_world()
+    write_keypoints(folder / "tilted.npz", keypoints_of(tilted(joints)[..., :2]))
     write_keypoints(folder / "seen.csv", keypoints_of(pixels, image_size=None))
     write_openpose(folder / "json", pixels.numpy())
     with VideoWriter(folder / "clip.mp4", 50.0, (WIDTH, HEIGHT)) as writer:
@@ -83,20 +87,58 @@ def test_the_world_of_a_guessed_camera_is_upright(track, scene, tmp_path):
     ],
 )
 def test_poses_are_those_of_a_camera_file(track, scene, tmp_path, cameras, words):
-    done = track(cameras, *words)
+    done = track(cameras, *words, "--tilt", 0)
     assert done.code == 0, done.err
     assert ("a focal length" in done.out) == (
         cameras == "uncalibrated" and "known.npz" not in words
     )
     poses = BodyTrack.load(tmp_path / "out" / "body.npz")
-    assert track(scene[0] / "cameras.toml", *words).code == 0
+    assert track(scene[0] / "cameras.toml", *words, "--up", "y").code == 0
     same = BodyTrack.load(tmp_path / "out" / "body.npz")
     assert torch.allclose(poses.joints3d, same.joints3d, atol=1e-4)
 
 
 @pytest.mark.parametrize(
+    ("words", "said", "off"),
+    [
+        (
+            ("--tilt=-12", "--roll", 8),
+            "looks down by 12 degrees and is rolled by 8 clockwise",
+            1e-6,
+        ),
+        ((), "degrees and is rolled by", math.radians(8.0)),
+        (("--persons", "all"), "by how people stand", math.radians(8.0)),
+    ],
+)
+def test_a_tilt_is_stated_or_found(track, scene, tmp_path, words, said, off):
+    done = track("uncalibrated", "tilted.npz", *words)
+    assert done.code == 0, done.err
+    assert "the camera looks down by" in done.out and said in done.out and AXES in done.out
+    written = PinholeCamera.load(tmp_path / "out" / "camera.toml")
+    true = level_camera().tilted(math.radians(-12.0), math.radians(8.0)).in_level_world()
+    up, true_up = written.rotation_matrix[:, 1], true.rotation_matrix[:, 1]
+    assert math.acos(min(1.0, float(up @ true_up))) < off + 1e-6
+    poses = BodyTrack.load(tmp_path / "out" / "body.npz").joints3d
+    body = poses[:, HEAD] - poses[:, PELVIS]
+    assert float((body[:, 1] / body.norm(dim=-1)).mean()) > math.cos(math.radians(10.0))
+
+
+def test_where_nobody_stands_the_camera_is_taken_to_be_level(track, scene, tmp_path):
+    seen = scene[1].clone()
+    seen[:, [BODY_15.joint(f"{side}_knee") for side in ("left", "right")]] = torch.nan
+    pixels = level_camera()(seen)[..., :2]
+    write_keypoints(tmp_path / "no_knees.npz", keypoints_of(pixels))
+    done = track("uncalibrated", tmp_path / "no_knees.npz")
+    assert done.code == 0, done.err
+    assert "about level" in done.out and "nobody was seen to stand" in done.out
+
+
+@pytest.mark.parametrize(
     ("cameras", "words", "said"),
     [
+        ("uncalibrated", ("seen.npz", "--tilt", 5, "--up", "y"), "leave --up out"),
+        ("uncalibrated", ("seen.npz", "--tilt", 80), "at most 60"),
+        ("cameras.toml", ("seen.npz", "--roll", 5), "--roll is for a camera without a file"),
         ("uncalibrated", ("json",), "give the video by --videos, fx,fy,cx,cy"),
         ("uncalibrated", ("seen.npz", "seen.csv"), "stands for one camera, got 2 inputs"),
         ("uncalibrated", ("clip.mp4",), "silhouettes need a TOML file"),
@@ -106,8 +148,11 @@ def test_poses_are_those_of_a_camera_file(track, scene, tmp_path, cameras, words
         ("uncalibrated.toml", ("seen.npz",), "no such file"),
     ],
 )  # fmt: skip
-def test_what_one_camera_without_a_file_cannot_do_is_refused(track, tmp_path, cameras, words, said):
-    done = track(cameras, *words)
+def test_what_one_camera_without_a_file_cannot_do_is_refused(
+    track, scene, tmp_path, cameras, words, said
+):
+    there = scene[0] / cameras
+    done = track(there if there.exists() else cameras, *words)
     assert done.code == 2 and said in done.err, done.err
     assert len(done.err.splitlines()) == 1
     assert not (tmp_path / "out").exists()

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 _UNCALIBRATED = "uncalibrated"
 _NAME = "camera"
 _AXES = "the axes of the world are x right, y up, z towards the viewer, with the origin in the lens"
-_LEVEL = (
-    f"the camera has no pose: {_AXES}; it is taken to be about level (--tilt and --roll say otherwise)"
-)
+_LEVEL = f"the camera has no pose: {_AXES}; it is taken to be about level (--tilt and --roll say otherwise)"
 
 
 def needs_no_file(cameras: str) -> bool:

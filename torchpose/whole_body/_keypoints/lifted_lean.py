@@ -35,7 +35,9 @@ def lean_of_network(elevation: Tensor) -> Tensor:
 
 
 def without_lean(
-    joints: Float[Tensor, "*batch J 3"], ray: Float[Tensor, "*batch 2"], up: Float[Tensor, "*#batch 3"]
+    joints: Float[Tensor, "*batch J 3"],
+    ray: Float[Tensor, "*batch 2"],
+    up: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*batch J 3"]:
     """Return joints, relative to the pelvis, without the turn that the network gives them on average.
 
@@ -43,7 +45,9 @@ def without_lean(
         joints: camera axes. ray: (x, y) of K^-1 [u, v, 1] of the body. up: the direction that points up, of
             length one, in the same axes.
     """
-    sight = torch.nn.functional.normalize(torch.cat([ray, torch.ones_like(ray[..., :1])], -1), dim=-1)
+    sight = torch.nn.functional.normalize(
+        torch.cat([ray, torch.ones_like(ray[..., :1])], -1), dim=-1
+    )
     up = up.expand_as(sight)
     turn = lean_of_network((sight * up).sum(-1).clamp(-1, 1).asin())
     axis = torch.nn.functional.normalize(torch.linalg.cross(sight, up), dim=-1)
