@@ -1,9 +1,9 @@
 """One camera that nobody calibrated, level and tilted: a phone in portrait.
 
-Of every scored group of recordings some are seen from 3 to 5 m, within 60 degrees of the front, at 30 frames a
-second, with a detector's faults; keypoints outside of the image are missing. A tilted camera either looks at
-the middle of the person from above or below, or stays at 0.8 to 1.6 m and is turned there. Nobody is told the
-focal length, which is that of the guess unless the view says otherwise.
+Of every scored group of recordings some are seen from 3 to 5 m, within 60 degrees of the front, at 30 frames
+a second, with a detector's faults; keypoints outside of the image are missing. A tilted camera either looks
+at the middle of the person from above or below, or stays at 0.8 to 1.6 m and is turned there. Nobody is told
+the focal length, which is that of the guess unless the view says otherwise.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from benchmarks.keypoint_bodies.clips import (
     mean_left,
     recorded,
 )
-from benchmarks.keypoint_bodies.methods import CAUSAL, LIFTERS, Method
+from benchmarks.keypoint_bodies.methods import CAUSAL, Method
 from benchmarks.keypoint_bodies.scoring import from_the_start
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig, PinholeCamera
@@ -102,7 +102,7 @@ def add_tilt_tables(
     """Add the tables of one camera that nobody calibrated.
 
     Args:
-        report: gets the tables. lifters: by name, those of `LIFTERS`. data: folder with the sets.
+        report: gets the tables. lifters: by name, of one camera. data: folder with the sets.
         quick: few recordings and views, to see that it works.
     """
     every = [name for name in _VIEWS if not quick or name in ("level", "10 up")]
@@ -197,13 +197,10 @@ def _errors(
     rows["kalman *, found"] = [
         _found(*given, level) for given in zip(people, unknown, angles, strict=True)
     ]
-    scores = {
-        name: [
-            _scores(_joints(track), camera, one)
-            for (track, camera), one in zip(tracks, people, strict=True)
-        ]
-        for name, tracks in rows.items()
-    }
+    scores = {}
+    for name, tracks in rows.items():
+        pairs = zip(tracks, people, strict=True)
+        scores[name] = [_scores(_joints(track), camera, one) for (track, camera), one in pairs]
     for name, method in lifters.items():
         row = f"{name} *, level" if name in CAUSAL else f"{name}, level"
         scores[row] = [
@@ -275,9 +272,5 @@ def _of_angles(angles: Sequence[CameraTilt | None], view: _View) -> list[float]:
     found = torch.tensor([angle for angle in angles if angle is not None]).reshape(-1, 4).rad2deg()
     pitch, roll = found[:, 0] - view.pitch, found[:, 1] - view.roll
     inside = 100 * (pitch.abs() < 1.645 * found[:, 2]).double().mean()
-    return [
-        len(found),
-        float(pitch.square().mean().sqrt()),
-        float(inside),
-        float(roll.square().mean().sqrt()),
-    ]
+    errors = [float(off.square().mean().sqrt()) for off in (pitch, roll)]
+    return [len(found), errors[0], float(inside), errors[1]]

@@ -228,6 +228,15 @@ def test_quick_run_prints_people_who_lie(run_here):
         assert f"| kalman *, {row} |" in printed
 
 
+def test_quick_run_prints_cameras_that_are_tilted(run_here):
+    data = data_dir_or_skip(MHAD).parent
+    options = ("--data", str(data), "--quick", "--uncalibrated", "--methods", "kalman")
+    printed = run_here("keypoint_bodies.__main__", *options)
+    for row in ("level", "told", "found"):
+        assert printed.count(f"| kalman *, {row} |") == 6
+    assert "Tilt found, persons of a Kinect" in printed
+
+
 def test_quick_run_prints_people_behind_a_desk(run_here):
     data = data_dir_or_skip(MHAD).parent
     for name in (WALKS, ACTIONS):

@@ -173,8 +173,8 @@ def run(
         formats: also write the poses as body.trc, body.c3d or body.bvh.
         up: the axis of the cameras' world that points up: kalman expects people upright along it, and the
             files of --formats have y up. By default they have the axes of the world.
-        tilt: degrees by which a camera without a file looks up, negative if down. Without it, the tilt is found
-            by how people stand.
+        tilt: degrees by which a camera without a file looks up, negative if down. Without it, the tilt is
+            found by how people stand.
         roll: degrees by which a camera without a file is rolled clockwise, as seen from behind it.
         overlay: write a video per camera with the body drawn into it.
         pictures: write overlay.png, and for keypoints skeleton.png.

@@ -1,4 +1,4 @@
-"""Lifted bodies are turned upright by what is known of gravity, and people who stand tell how a camera is held."""
+"""Lifted bodies are upright where gravity is known, and people who stand tell how a camera is held."""
 
 import math
 

@@ -1,10 +1,10 @@
 """Find by how much the only camera is tilted and rolled, from how people stand in front of it.
 
-Trunk and legs of somebody who stands are vertical on average, up to a little lean ahead. Their direction, in the
-axes of the camera, tells its roll as it is. The network that lifts turns bodies by d(e) that are seen from
-the elevation e (`lifted_lean`), so a pitch p is expected to show the line of sight at e(p) + d(e(p)) against
-the body. The likelihood of what is seen, with a prior over p in which half of the cameras are about level and
-one over e, is added up over a grid of p.
+Trunk and legs of somebody who stands are vertical on average, up to a little lean ahead. Their direction, in
+the axes of the camera, tells its roll as it is. The network that lifts turns bodies by d(e) that are seen
+from the elevation e (`lifted_lean`), so a pitch p is expected to show the line of sight at e(p) + d(e(p))
+against the body. The likelihood of what is seen, with a prior over p in which half of the cameras are about
+level and one over e, is added up over a grid of p.
 """
 
 import math

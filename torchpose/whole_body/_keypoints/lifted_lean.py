@@ -1,9 +1,9 @@
 """Turn lifted bodies upright that are seen from above or below.
 
-The network that lifts was fitted to cameras that look at people from about their own height. Somebody who is seen
-from above or below it takes for somebody who leans: the body is turned about the horizontal axis across the
-line of sight, while its shape is little worse. Where it is known which way is up, so is the elevation e of the
-line of sight to the body, and with it the mean turn
+The network that lifts was fitted to cameras that look at people from about their own height. Somebody who is
+seen from above or below it takes for somebody who leans: the body is turned about the horizontal axis across
+the line of sight, while its shape is little worse. Where it is known which way is up, so is the elevation e
+of the line of sight to the body, and with it the mean turn
 
     d(e) = c_0 + c_1 e + c_2 e^2 + c_3 e^3,
 
