@@ -41,7 +41,7 @@ from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_
 __all__ = ["add_tilt_tables"]
 
 _FPS, _FRAMES, _QUICK_FRAMES = 30.0, 45, 20
-_EVERY, _KINECT_EVERY = 4, 4  # recordings of each group
+_EVERY, _KINECT_EVERY = 4, 5  # recordings of each group
 _WIDTH, _HEIGHT = 1080, 1920
 _DISTANCE, _LENS, _AROUND, _NEAREST, _AIM = (3.0, 5.0), (0.8, 1.6), math.radians(60.0), 2.0, 0.95
 _PELVIS = BODY_15.joint("pelvis")
@@ -77,7 +77,6 @@ _VIEWS = {
     "turned 15 up": _View(15.0, turned=True),
     "level, f x 0.75": _View(focal=0.75),
     "level, f x 1.33": _View(focal=1.33),
-    "10 up, f x 0.75": _View(10.0, focal=0.75),
     "20 down, f x 1.33": _View(-20.0, focal=1.33),
 }
 
