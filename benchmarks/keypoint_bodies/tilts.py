@@ -192,7 +192,7 @@ def _errors(
     rows = {"kalman *, level": [(track, level) for track in unknown]}
     told = people[0].camera
     rows["kalman *, told"] = [(track, told) for track in _tracked(people, told, up="y")]
-    angles = [find_camera_tilt([track], level) for track in unknown]
+    angles = [find_camera_tilt([track], CameraRig([level])) for track in unknown]
     rows["kalman *, found"] = [
         _found(*given, level) for given in zip(people, unknown, angles, strict=True)
     ]

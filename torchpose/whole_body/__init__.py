@@ -14,7 +14,6 @@ from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFi
 from torchpose.whole_body._filters.sir import SIRParticleFilter
 from torchpose.whole_body._first_pose import find_first_pose
 from torchpose.whole_body._following import track_body
-from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_tilt
 from torchpose.whole_body._pose_search import find_pose
 from torchpose.whole_body._sharpness import fit_sharpness
 from torchpose.whole_body._silhouettes.likelihood import bidirectional
@@ -27,7 +26,6 @@ __all__ = [
     "BodyStream",
     "BodyTrack",
     "BodyTracker",
-    "CameraTilt",
     "ConstrainedParticleFilter",
     "ManifoldParticleFilter",
     "RootUncertaintyTracker",
@@ -37,7 +35,6 @@ __all__ = [
     "constant_velocity_std",
     "count_pixels",
     "default_step_std",
-    "find_camera_tilt",
     "find_first_pose",
     "find_pose",
     "fit_sharpness",

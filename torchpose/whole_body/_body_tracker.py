@@ -37,6 +37,7 @@ from torchpose.whole_body._filter_table import BodyTrackerOptions, choose_method
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._following import Observed
+from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_tilt
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker, LiveBody
 from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
@@ -477,6 +478,27 @@ class BodyTracker(nn.Module):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
         return self._tracked(state, self._by_particles.observed(silhouettes, given)[0])
+
+    def find_tilt(self, tracks: Sequence[BodyTrack]) -> CameraTilt | None:
+        """Find by how much the only camera looks up and is rolled, from how people stand in front of it.
+
+        `camera.tilted(pitch, roll).in_level_world()` is the camera as it is held, and `up="y"` goes with it.
+
+        Args:
+            tracks: of all persons, by this tracker.
+
+        Returns:
+            `pitch`, `roll`, `pitch_std` and `roll_std`, radians; None if nobody stands for half a second.
+
+        Raises:
+            InputError: several cameras, another method than "kalman", or a tracker that knows which way is up.
+        """
+        if self.by_keypoints is None or len(self.cameras) > 1 or self.by_keypoints.up is not None:
+            raise InputError(
+                f"a tilt is found by one camera with method={KEYPOINT_METHOD!r} and without `up`; got method "
+                f"{self.method} and {len(self.cameras)} cameras"
+            )
+        return find_camera_tilt(tracks, self.cameras) if tracks else None
 
     def _tracked(
         self, state: BodyStream, frames: Iterable[Observed]

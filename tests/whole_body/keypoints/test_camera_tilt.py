@@ -8,9 +8,11 @@ import torch
 import torchpose
 from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body
 from torchpose.body import BODY_15
-from torchpose.camera import PinholeCamera
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.errors import InputError
 from torchpose.math._rotations import rotvec_to_matrix
-from torchpose.whole_body import BodyTrack, find_camera_tilt
+from torchpose.whole_body import BodyTrack
+from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_tilt
 from torchpose.whole_body._keypoints.lifted_lean import lean_of_network, without_lean
 
 WIDTH, HEIGHT = 1080, 1920
@@ -73,7 +75,7 @@ def _relative() -> torch.Tensor:
 def test_somebody_who_stands_tells_how_the_camera_is_held(pitch, roll):
     level = camera_of()
     track = tracked(seen_by(camera_of(pitch, roll)), level)
-    found = find_camera_tilt([track, track], level)
+    found = find_camera_tilt([track, track], CameraRig([level]))
     assert found is not None
     angles = [math.degrees(angle) for angle in found]
     assert angles[0] == pytest.approx(pitch, abs=5.0) and angles[1] == pytest.approx(roll, abs=2.0)
@@ -85,7 +87,7 @@ def test_the_pose_of_the_camera_that_tracked_does_not_matter():
     elsewhere = PinholeCamera.from_image_size(WIDTH, HEIGHT)
     elsewhere.translation[:] = torch.tensor([1.0, -2.0, 0.5])
     pairs = [(tracked(pixels, camera), camera) for camera in (camera_of(), elsewhere)]
-    found = [find_camera_tilt([track], camera) for track, camera in pairs]
+    found = [find_camera_tilt([track], CameraRig([camera])) for track, camera in pairs]
     torch.testing.assert_close(torch.tensor(found[0]), torch.tensor(found[1]), atol=1e-6, rtol=0)
 
 
@@ -93,10 +95,21 @@ def test_who_hides_the_legs_or_sits_tells_nothing():
     level = camera_of()
     pixels = seen_by(level)
     pixels[..., LEGS, :] = torch.nan
-    assert find_camera_tilt([tracked(pixels, level)], level) is None
+    assert find_camera_tilt([tracked(pixels, level)], CameraRig([level])) is None
     track = tracked(seen_by(level), level)
     sitting = track.joints3d.clone()
     ahead = torch.tensor([0.0, 0.4, 0.4]).to(sitting)
     sitting[:, LEGS] += ahead
     track.joints3d = sitting
-    assert find_camera_tilt([track], level) is None
+    assert find_camera_tilt([track], CameraRig([level])) is None
+
+
+def test_a_tracker_finds_the_tilt_of_its_only_camera():
+    camera = camera_of()
+    tracker = torchpose.BodyTracker([camera], "kalman", fps=FPS)
+    track = tracker(keypoints=seen_by(camera_of(12.0)), names=NAMES)
+    assert isinstance(found := tracker.find_tilt([track]), CameraTilt)
+    assert found == find_camera_tilt([track], CameraRig([camera]))
+    assert tracker.find_tilt([]) is None
+    with pytest.raises(InputError, match="without `up`"):
+        torchpose.BodyTracker([camera], "kalman", fps=FPS, up="y").find_tilt([track])

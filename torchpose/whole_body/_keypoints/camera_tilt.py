@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchpose.body._skeleton import BODY_15
-from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._rig import CameraRig
 from torchpose.camera._tilt import angles_of_up, up_of_angles
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.lifted_lean import lean_of_network
@@ -57,14 +57,17 @@ class CameraTilt(NamedTuple):
     roll_std: float
 
 
-def find_camera_tilt(tracks: Sequence[BodyTrack], camera: PinholeCamera) -> CameraTilt | None:
-    """Return pitch and roll of the only camera, None if nobody stands for half a second.
+def find_camera_tilt(tracks: Sequence[BodyTrack], rig: CameraRig) -> CameraTilt | None:
+    """Find pitch and roll of the only camera.
 
     Args:
         tracks: of all persons, by keypoints of this camera alone without `up`.
-        camera: in which they were tracked, as it was given.
+        rig: of this camera, as it was given to the tracker.
+
+    Returns:
+        The angles, None if nobody stands for half a second.
     """
-    joints = torch.cat([_in_camera(track, camera) for track in tracks])
+    joints = torch.cat([_in_camera(track, rig) for track in tracks])
     fps = tracks[0].fps or 30.0
     stands, up = _standing(joints)
     if len(joints) == 0 or stands.sum() < max(_LEAST_TIME * fps, _LEAST_SHARE * len(joints)):
@@ -78,11 +81,11 @@ def find_camera_tilt(tracks: Sequence[BodyTrack], camera: PinholeCamera) -> Came
     return CameraTilt(pitch, kept * seen_roll, pitch_std, math.sqrt(kept) * _ROLL_STD)
 
 
-def _in_camera(track: BodyTrack, camera: PinholeCamera) -> Float[Tensor, "T 15 3"]:
+def _in_camera(track: BodyTrack, rig: CameraRig) -> Float[Tensor, "T 15 3"]:
     """Return joints in axes of the camera, of frames in which it sees trunk and legs."""
     seen = track.details["inlier"][:, 0] > 0.5
     there = torch.stack([seen[:, pair].any(1) for pair in (_SHOULDERS, _HIPS, _KNEES)]).all(0)
-    R, t = camera.rotation_matrix.to(track.joints3d), camera.translation.to(track.joints3d)
+    R, t = (value[0].to(track.joints3d) for value in (rig.rotation, rig.translation))
     return track.joints3d[there] @ R.mT + t
 
 

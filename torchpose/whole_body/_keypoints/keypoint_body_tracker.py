@@ -111,6 +111,7 @@ class KeypointBodyTracker(nn.Module):
     ) -> None:
         super().__init__()
         _check_camera_height(camera_height, rig, up)
+        self.up = up
         self._rig, self.fps = (rig,), float(fps)  # a tuple: its tensors are those of who gives it
         alone = len(rig) == 1
         std_of_one = _KEYPOINT_STD_OF_ONE if keypoint_std is None else keypoint_std
