@@ -491,7 +491,7 @@ class BodyTracker(nn.Module):
             `pitch`, `roll`, `pitch_std` and `roll_std`, radians; None if nobody stands for half a second.
 
         Raises:
-            InputError: several cameras, another method than "kalman", or a tracker that knows which way is up.
+            InputError: several cameras, another method than "kalman", or a tracker that was told `up`.
         """
         if self.by_keypoints is None or len(self.cameras) > 1 or self.by_keypoints.up is not None:
             raise InputError(
