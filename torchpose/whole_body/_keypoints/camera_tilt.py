@@ -27,19 +27,16 @@ _SHOULDERS, _HIPS, _KNEES, _ANKLES = (
     for name in ("shoulder", "hip", "knee", "ankle")
 )
 _STRAIGHT, _IN_LINE = math.cos(math.radians(35.0)), math.cos(math.radians(30.0))  # knees and hips
-_LEAST_TIME, _LEAST_SHARE = (
-    0.5,
-    0.3,
-)  # seconds in which people stand, and of frames with seen joints
+# People have to stand for so many seconds, and in this share of the frames in which they are seen.
+_LEAST_TIME, _LEAST_SHARE = 0.5, 0.3
 _LEAN = 0.05  # ahead of those who stand, radians
 _STD, _ROLL_STD = math.radians(2.8), math.radians(2.2)  # of directions, by persons
 # Standard deviations of priors, radians: of pitches of cameras that are about level and of others, half of
 # each; of rolls; mean and deviation of the elevation of lines of sight.
 _LEVEL, _OTHERS, _ROLLS = math.radians(3.0), math.radians(15.0), math.radians(10.0)
 _SIGHT = (math.radians(-2.0), math.radians(14.0))
-_UNSURE = math.radians(
-    4.0
-)  # of the pitch on top of the posterior: persons differ from the mean d(e)
+# Of the pitch on top of the posterior: persons differ from the mean d(e).
+_UNSURE = math.radians(4.0)
 _GRID, _STEP = math.radians(45.0), math.radians(0.5)
 
 
