@@ -107,7 +107,7 @@ def test_settings_are_the_options_of_track() -> None:
     theirs = vars(track_command().parser().get_defaults())
     assert {name: theirs[name] for name in own} == own
     of_video = {"hands", "background", "edges", "candidates", "elbows", "face_model", "overlay"}
-    of_video |= {"max_persons", "detector", "min_confidence"}
+    of_video |= {"max_persons", "detector", "min_confidence", "workers"}
     assert set(theirs) - set(own) == {"config", "input", "out", "pictures"} | of_video
 
 
