@@ -6,7 +6,8 @@ The seven clips of video_asl, 640 x 480, one after the other as one H.264 file, 
 drawing not. `--mediapipe` is the interpreter of an environment with mediapipe 0.10.21 (see
 `mediapipe_landmarks.py`); its full pose model then reads the same file in the same run.
 
-Stages are timed by the clock of the thread that they run in, in a run of their own.
+The first row has another process that looks at the images, whose time the column of CPU leaves out. Stages
+are timed by the clock of the thread that they run in, in a run of their own and in one process.
 """
 
 import functools
