@@ -9,13 +9,14 @@ the focal length, which is that of the guess unless the view says otherwise.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
 import torchpose
@@ -213,19 +214,10 @@ def _tracked(
     people: Sequence[_Seen], camera: PinholeCamera, up: str | None = None
 ) -> list[BodyTrack]:
     """Return the tracks of people whom one camera is taken to see."""
-    longest = max(len(one.joints) for one in people)
-
-    def padded(values: Iterator[Tensor], missing: float) -> Tensor:
-        rows = list(values)
-        every = rows[0].new_full((len(rows), longest, *rows[0].shape[1:]), missing)
-        for row, value in zip(every, rows, strict=True):
-            row[: len(value)] = value
-        return every
-
     tracker = torchpose.BodyTracker([camera], method="kalman", fps=_FPS, up=up)
     tracks = tracker(
-        keypoints=padded((one.keypoints for one in people), math.nan),
-        confidence=padded((one.confidence for one in people), 0.0),
+        keypoints=pad_sequence([one.keypoints for one in people], True, math.nan),
+        confidence=pad_sequence([one.confidence for one in people], True),
         names=BODY_15.names,
         lengths=torch.tensor([len(one.joints) for one in people]),
     )

@@ -85,7 +85,7 @@ def tilt_of(
     from torchpose.camera._rig import CameraRig
     from torchpose.whole_body._keypoints.camera_tilt import find_camera_tilt
 
-    found = find_camera_tilt(people, CameraRig([camera])) if people else None
+    found = find_camera_tilt(people, CameraRig([camera]))
     if found is None:
         return None, f"{_LEVEL}: nobody was seen to stand for half a second"
     pitch, roll, *stds = map(math.degrees, found)

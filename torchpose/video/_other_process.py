@@ -23,9 +23,8 @@ from torchpose.video._prefetch import prefetch
 
 LONG = 450  # frames from which on a recording is worth the start of a process
 _UNKNOWN = 300  # frames after which one of unknown length is taken to be long
-AHEAD = (
-    WAITING - 2
-)  # frames that wait to be measured: they last while the poses of a block are made
+# Frames that wait to be measured: they last while the poses of a block are made.
+AHEAD = WAITING - 2
 _MEMORY = 1 << 26  # bytes that frames, and what they show, share with the process
 _PROGRAM = "import sys; sys.path[:] = {!r}; from {} import serve; serve({}, {})"
 

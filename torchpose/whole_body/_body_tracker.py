@@ -498,7 +498,7 @@ class BodyTracker(nn.Module):
                 f"a tilt is found by one camera with method={KEYPOINT_METHOD!r} and without `up`; got method "
                 f"{self.method} and {len(self.cameras)} cameras"
             )
-        return find_camera_tilt(tracks, self.cameras) if tracks else None
+        return find_camera_tilt(tracks, self.cameras)
 
     def _tracked(
         self, state: BodyStream, frames: Iterable[Observed]

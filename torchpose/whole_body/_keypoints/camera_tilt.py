@@ -58,12 +58,14 @@ def find_camera_tilt(tracks: Sequence[BodyTrack], rig: CameraRig) -> CameraTilt 
     """Find pitch and roll of the only camera.
 
     Args:
-        tracks: of all persons, by keypoints of this camera alone without `up`.
+        tracks: of all persons, if any, by keypoints of this camera alone without `up`.
         rig: of this camera, as it was given to the tracker.
 
     Returns:
         The angles, None if nobody stands for half a second.
     """
+    if not tracks:
+        return None
     joints = torch.cat([_in_camera(track, rig) for track in tracks])
     fps = tracks[0].fps or 30.0
     stands, up = _standing(joints)
