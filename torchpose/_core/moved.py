@@ -344,7 +344,7 @@ def moved_from(package: str) -> list[tuple[str, str, str]]:
     """Return present home, old name and present name of each object that has left a package."""
     return [
         (home, old, new or old)
-        for home, names in NAMES[package].items()
+        for home, names in NAMES.get(package, {}).items()
         for old, _, new in (name.partition("=") for name in names.split())
     ]
 

@@ -2,11 +2,12 @@
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchpose.cli._common import save_pictures
+from torchpose.cli._picture_process import PictureProcess
 
 if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
@@ -80,27 +81,50 @@ def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
     return written
 
 
-def write_pictures(track: "PoseTrack", out: Path) -> list[Path]:
-    """Draw one sequence if there is a pose in it, and return the paths of the pictures."""
-    return save_pictures(out, track_pictures(track)) if _has_poses(track) else []
+def write_pictures(
+    track: "PoseTrack", out: Path, other: PictureProcess | None = None
+) -> list[Path]:
+    """Draw one sequence if there is a pose in it, and return the paths of the pictures.
+
+    Args:
+        track: the track of the sequence. out: folder. other: process that draws them, if there is one.
+    """
+    if not _has_poses(track):
+        return []
+    pictures = track_pictures(track)
+    drawn = None if other is None else other.draw(pictures)
+    return save_pictures(out, pictures) if drawn is None else _write_files(out, drawn)
+
+
+def _write_files(out: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write files by name, and return their paths."""
+    from torchpose._core.files import atomic_path
+
+    for name, content in contents.items():
+        with atomic_path(out / name) as temporary:
+            temporary.write_bytes(content)
+    return [out / name for name in contents]
 
 
 def _has_poses(track: "PoseTrack") -> bool:
     return bool(track.joints3d.isfinite().all(-1).any())
 
 
-def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) -> dict[str, Any]:
+def track_pictures(
+    track: "PoseTrack", truth: Any = None, labels: Any = None
+) -> dict[str, Callable[[], Any]]:
     """Return the pictures of one sequence by file name, each as a function that draws it."""
-    from torchpose import viz
+    from torchpose.viz._charts import prepare_joint_curves
+    from torchpose.viz._skeletons import prepare_pose_strip
 
     joints, observed = track.joints3d[0], track.observed[0]
     fps, first = track.fps or 30.0, track.first_frame
     return {
-        "pose_strip.png": lambda: viz.plot_pose_strip(
+        "pose_strip.png": prepare_pose_strip(
             joints, fps=fps, observed=observed, truth=truth, labels=labels, title="Tracked poses",
             first_frame=first,
         ),
-        "joint_curves.png": lambda: viz.plot_joint_curves(
+        "joint_curves.png": prepare_joint_curves(
             joints, track.covariance3d[0], observed, truth, fps=fps,
             title="Hands and elbows with 90 % bands", first_frame=first,
         ),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from torchpose._core.terminal import show_progress
 from torchpose._core.wording import counted
 from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cores
+from torchpose.cli._picture_process import PictureProcess
 from torchpose.cli._track_output import (
     TrackingJob,
     camera_text,
@@ -67,6 +68,8 @@ def track_video(
             camera = settings.hold(camera)
             tracker = _tracker(job, options, face_model, prior, camera, source.fps)
             results = stack.enter_context(track_results(job.out, job.files, pictures, overlay))
+            other = PictureProcess(pictures and source.reopenable)
+            stack.enter_context(contextlib.closing(other))
             start = time.perf_counter()
             if source.reopenable:
                 people, n_read = _track_recording(tracker, source, results.stage, workers)
@@ -91,7 +94,7 @@ def track_video(
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         names = _names(people, source.reopenable)
         notes = _notes_of_all(people, names)
-        written = _write_poses(people, source, n_frames, results, pictures, overlay)
+        written = _write_poses(people, source, n_frames, results, pictures, overlay, other)
         if overlay:
             title = Path(job.input).name
             shown = _write_report(results.stage, people, names, n_frames, facts, notes, title)
@@ -125,12 +128,12 @@ def _write_poses(
     results: "ResultsFolder",
     pictures: bool,
     overlay: bool,
+    other: PictureProcess,
 ) -> list[Path]:
     """Write the poses of everybody, then what shows them: pictures, and the overlay of a recording."""
     written = results.commit(write_people(people, results.stage))
-    # Python is free for the pictures for most of the time that the encoder takes
     with ThreadPoolExecutor(1) as beside:
-        drawing = beside.submit(_pictures_of, people[0], results.stage, pictures)
+        drawing = beside.submit(_pictures_of, people[0], results.stage, pictures, other)
         try:
             if overlay and source.reopenable:
                 write_overlay(results.stage / _OVERLAY, source.reopen(), people, n_frames)
@@ -139,8 +142,10 @@ def _write_poses(
     return written
 
 
-def _pictures_of(person: "TrackedPerson", out: Path, wanted: bool) -> list[Path]:
-    return write_pictures(person.track, out) if wanted else []
+def _pictures_of(
+    person: "TrackedPerson", out: Path, wanted: bool, other: PictureProcess
+) -> list[Path]:
+    return write_pictures(person.track, out, other) if wanted else []
 
 
 def _open(where: str, fps: float | None) -> "VideoSource":

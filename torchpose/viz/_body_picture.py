@@ -11,12 +11,12 @@ from torch import Tensor
 from torchpose._core.checks import check_shape
 from torchpose.body._feet import FEET, FOOT_BONES
 from torchpose.body._skeleton import BODY_15, BodySkeleton
+from torchpose.viz._pose_drawing import measured_entries
 from torchpose.viz._skeletons import (
     _choose_frames,
     _limits,
     _set_view,
     draw_skeleton,
-    measured_entries,
 )
 from torchpose.viz._style import (
     INK,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,6 +16,7 @@ from torchpose.errors import InputError
 from torchpose.metrics._calibration import Coverage, chi2_quantile
 from torchpose.metrics._pose_errors import PCP
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.viz._pose_drawing import draw_curves
 from torchpose.viz._skeletons import _check_poses
 from torchpose.viz._style import (
     INK,
@@ -42,8 +44,7 @@ else:
 CURVE_JOINTS = ("hand_left", "elbow_left", "hand_right", "elbow_right")
 ERROR_JOINTS = ("hand_left", "hand_right", "elbow_left", "elbow_right", "shoulder_left",
                 "shoulder_right")  # fmt: skip
-_GAP, _BAND = "#F1E9D2", "#EDEDED"
-_DASHED = (0, (3, 1.5))
+_BAND = "#EDEDED"
 
 
 def plot_joint_curves(
@@ -76,62 +77,52 @@ def plot_joint_curves(
         ShapeError: other sizes. InputError: an unknown joint.
             MissingDependencyError: matplotlib is missing.
     """
-    _check_poses(joints)
-    require_matplotlib()
-    from matplotlib.patches import Patch
-
-    rows, dims = _indices(show), joints.shape[-1]
-    axes_names = (
-        ("x, right (m)", "y, down (m)", "z, away (m)") if dims == 3 else ("u (px)", "v (px)")
+    draw = prepare_joint_curves(
+        joints, covariance, observed, truth, fps, show, level, title, first_frame
     )
-    figure = new_figure(4.0 * dims, 1.65 * len(rows) + 0.9, title)
-    grid = figure.subplots(len(rows), dims, sharex=True, squeeze=False)
-    time = (first_frame + torch.arange(joints.shape[0]).numpy()) / fps
-    half = float(chi2_quantile(torch.tensor(level, dtype=torch.float64), 1).sqrt())
-    colors = joint_colors(UPPER_BODY)
-    for row, joint in enumerate(rows):
-        never = observed is not None and not bool(observed[:, joint].any())
-        for d in range(dims):
-            ax = style_axes(grid[row, d], "time (s)" if row == len(rows) - 1 else "")
-            if row == 0:
-                ax.set_title(axes_names[d], fontsize=NORMAL, color=INK)
-            if observed is not None and not never:
-                for start, stop in _spans(~observed[:, joint]):
-                    ends = ((first_frame + start) / fps, (first_frame + stop) / fps)
-                    ax.axvspan(*ends, color=_GAP, linewidth=0, zorder=0)
-            _draw_curve(
-                ax, time, joints[:, joint, d], colors[joint],
-                None if covariance is None else half * to_numpy(covariance[:, joint, d, d]) ** 0.5,
-                None if truth is None else truth[:, joint, d],
-            )  # fmt: skip
-            if dims == 2 and d == 1:
-                ax.invert_yaxis()
-        note = "\n(inferred throughout)" if never else ""
-        label = readable(UPPER_BODY[joint]) + note
-        grid[row, 0].set_ylabel(label, fontsize=NORMAL, color=INK)
-    entries = [legend_line("estimate", MUTED, linewidth=1.5)]
+    return draw()
+
+
+def prepare_joint_curves(
+    joints: Float[Tensor, "T 8 D"],
+    covariance: Float[Tensor, "T 8 D D"] | None = None,
+    observed: Bool[Tensor, "T 8"] | None = None,
+    truth: Float[Tensor, "T 8 D"] | None = None,
+    fps: float = 30.0,
+    show: Sequence[str] = CURVE_JOINTS,
+    level: float = 0.9,
+    title: str | None = None,
+    first_frame: int = 0,
+) -> Callable[[], Figure]:
+    """Return what draws coordinates over time, which another process can do; see `plot_joint_curves`."""
+    _check_poses(joints)
+    rows = _indices(show)
+    spread = gaps = None
+    labels = [readable(name) for name in show]
     if covariance is not None:
-        entries.append(Patch(color=PALE, label=f"{100 * level:.0f} % band"))
-    if truth is not None:
-        entries.append(legend_line("truth", linewidth=1.1, linestyle=_DASHED))
+        half = float(chi2_quantile(torch.tensor(level, dtype=torch.float64), 1).sqrt())
+        spread = half * to_numpy(covariance[:, rows].diagonal(dim1=-2, dim2=-1)) ** 0.5
     if observed is not None:
-        entries.append(Patch(color=_GAP, label="not measured here: inferred"))
-    figure.align_ylabels(grid[:, 0])
-    add_legend(figure, entries)
-    return figure
-
-
-def _draw_curve(
-    ax: Axes, time: Any, values: Tensor, color: str, spread: Any, truth: Tensor | None
-) -> None:
-    """Draw one coordinate over time, a band of this half width about it, and the true one."""
-    middle = to_numpy(values)
-    if spread is not None:
-        ax.fill_between(time, middle - spread, middle + spread, color=color, alpha=0.2, linewidth=0)
-    if truth is not None:
-        ax.plot(time, to_numpy(truth), color=INK, linewidth=1.1, linestyle=_DASHED)
-    ax.plot(time, middle, color=color, linewidth=1.5)
-    ax.margins(x=0)
+        seen = observed[:, rows].any(0).tolist()
+        gaps = [
+            [((first_frame + a) / fps, (first_frame + b) / fps) for a, b in _spans(~flag)] * ever
+            for flag, ever in zip(observed[:, rows].unbind(1), seen, strict=True)
+        ]
+        notes = ["" if ever else "\n(inferred throughout)" for ever in seen]
+        labels = [label + note for label, note in zip(labels, notes, strict=True)]
+    colors = joint_colors(UPPER_BODY)
+    return partial(
+        draw_curves,
+        (first_frame + torch.arange(joints.shape[0]).numpy()) / fps,
+        to_numpy(joints[:, rows]),
+        spread,
+        None if truth is None else to_numpy(truth[:, rows]),
+        gaps,
+        labels,
+        [colors[joint] for joint in rows],
+        level,
+        title,
+    )
 
 
 def _indices(names: Sequence[str]) -> list[int]:

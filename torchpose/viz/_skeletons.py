@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
@@ -15,19 +16,16 @@ from torchpose.errors import InputError, ShapeError
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS
+from torchpose.viz._pose_drawing import arm_entries, draw_bones, draw_strip
 from torchpose.viz._style import (
     INK,
     LARGE,
     LEFT,
     MIDDLE,
-    MUTED,
     PALE,
     RIGHT,
-    SMALL,
     add_legend,
     joint_colors,
-    label_row,
-    legend_line,
     new_figure,
     style_axes,
     to_numpy,
@@ -77,8 +75,6 @@ def draw_skeleton(
     Raises:
         ShapeError: joints of another shape, or of another number than there are colours.
     """
-    from matplotlib.collections import LineCollection
-
     check_shape("joints", joints, [None, 2])
     colors = list(colors or joint_colors(UPPER_BODY))
     if len(colors) != joints.shape[0]:
@@ -90,19 +86,8 @@ def draw_skeleton(
     if covariance is not None:
         for point, matrix, color in zip(points, covariance, colors, strict=True):
             _draw_ellipse(ax, point, matrix, color, level, alpha)
-    if len(limbs):
-        strokes = [colors[a] if colors[a] == colors[b] else MIDDLE for a, b in limbs]
-        lines = LineCollection(
-            points[list(limbs)], colors=strokes, linewidths=linewidth, alpha=alpha,
-            capstyle="round", zorder=3,
-        )  # fmt: skip
-        ax.add_collection(lines)
     filled = [True] * len(colors) if observed is None else observed.tolist()
-    faces = [c if f else "white" for c, f in zip(colors, filled, strict=True)]
-    ax.scatter(
-        points[:, 0], points[:, 1], s=(2.4 * linewidth) ** 2, c=faces, edgecolors=colors,
-        linewidths=0.55 * linewidth, alpha=alpha, zorder=4,
-    )  # fmt: skip
+    draw_bones(ax, points, filled, colors, limbs, linewidth, alpha)
 
 
 def _draw_ellipse(
@@ -125,35 +110,8 @@ def _draw_ellipse(
         )  # fmt: skip
 
 
-def _legend_entries(
-    observed: Tensor | None, covariance: Tensor | None, truth: Tensor | None, level: float
-) -> list[Any]:
-    from matplotlib.patches import Patch
-
-    entries = [
-        legend_line("person's left arm", LEFT, linewidth=3),
-        legend_line("person's right arm", RIGHT, linewidth=3),
-    ]
-    if observed is not None:
-        entries += measured_entries()
-    if covariance is not None:
-        label = f"{100 * level:.0f} % ellipse"
-        entries.append(Patch(facecolor="#DDDDDD", edgecolor=MUTED, label=label))
-    if truth is not None:
-        entries.append(legend_line("truth", PALE, linewidth=2.5))
-    return entries
-
-
-def measured_entries() -> list[Any]:
-    """Return what a legend says of filled and of hollow joints."""
-    return [
-        legend_line(name, MIDDLE, marker="o", linestyle="", markerfacecolor=face)
-        for name, face in (("measured", MIDDLE), ("inferred", "white"))
-    ]
-
-
-def _draw_truth(ax: Axes, joints: Tensor, linewidth: float = 2.0) -> None:
-    draw_skeleton(ax, joints, colors=[PALE] * joints.shape[0], linewidth=linewidth)
+def _draw_truth(ax: Axes, joints: Tensor) -> None:
+    draw_skeleton(ax, joints, colors=[PALE] * joints.shape[0], linewidth=2.0)
 
 
 def plot_pose(
@@ -196,7 +154,8 @@ def plot_pose(
         ax.invert_yaxis()
     else:
         ax.set(xlim=(0, image_size[0]), ylim=(image_size[1], 0))
-    add_legend(figure, _legend_entries(observed, covariance, truth, level))
+    ellipse = None if covariance is None else level
+    add_legend(figure, arm_entries(observed is not None, ellipse, truth is not None))
     return figure
 
 
@@ -248,7 +207,8 @@ def plot_pose_3d(
         ax.set_xlim(float(low[a]), float(high[a]))
         ends = (float(low[b]), float(high[b]))
         ax.set_ylim(ends if b == 2 else ends[::-1])
-    add_legend(figure, _legend_entries(observed, covariance, truth, level))
+    ellipse = None if covariance is None else level
+    add_legend(figure, arm_entries(observed is not None, ellipse, truth is not None))
     return figure
 
 
@@ -293,47 +253,48 @@ def plot_pose_strip(
         ShapeError: joints of another shape. InputError: no frame, one that there is not, labels of
             another number. MissingDependencyError: matplotlib is missing.
     """
+    draw = prepare_pose_strip(
+        joints, frames, n_frames, fps, observed, truth, labels, title, first_frame
+    )
+    return draw()
+
+
+def prepare_pose_strip(
+    joints: Float[Tensor, "T 8 D"],
+    frames: Sequence[int] | None = None,
+    n_frames: int = 8,
+    fps: float = 30.0,
+    observed: Bool[Tensor, "T 8"] | None = None,
+    truth: Float[Tensor, "T 8 D"] | None = None,
+    labels: Sequence[str] | None = None,
+    title: str | None = None,
+    first_frame: int = 0,
+) -> Callable[[], Figure]:
+    """Return what draws a strip of frames, which another process can do; see `plot_pose_strip`."""
     _check_poses(joints)
     if labels is not None and len(labels) != len(joints):
         raise InputError(
             f"labels must be a word for each of {len(joints)} frames, got {len(labels)}"
         )
     frames = _choose_frames(frames, n_frames, joints.shape[0])
-    columns = min(len(frames), 10)
-    lines = math.ceil(len(frames) / columns)
-    views = ((0, 1),) if joints.shape[-1] == 2 else ((0, 1), (2, 1))
     chosen = joints if truth is None else torch.cat([joints, truth], 1)
     low, high = _limits(chosen[frames], margin=0.06)
-    size = (high - low).tolist()
-    wide = max(size[across] for across, _ in views)
-    height = lines * (len(views) * 1.6 * size[1] / wide + 0.3 + 0.15 * (labels is not None)) + 0.7
-    figure = new_figure(columns * 1.6, height, title)
-    rows = figure.subplots(lines * len(views), 1, squeeze=False)[:, 0]
-    for row, ax in enumerate(rows):  # few axes with all frames side by side: each one costs time
-        ax.set_axis_off()
-        ax.set_aspect("equal")
-        ax.set(xlim=(0, columns * wide), ylim=(float(high[1]), float(low[1])))
-        if len(views) == 2:
-            label_row(ax, ("front", "side")[row % 2])
-    for place, frame in enumerate(frames):
-        line, column = divmod(place, columns)
-        middle = (column + 0.5) * wide
-        for row, pick in enumerate(views, line * len(views)):
-            shift = torch.zeros(2, dtype=torch.float64)
-            shift[0] = middle - float(low[pick[0]] + high[pick[0]]) / 2
-            if truth is not None:
-                _draw_truth(rows[row], truth[frame][:, pick].cpu() + shift, linewidth=1.5)
-            seen = None if observed is None else observed[frame]
-            drawn = joints[frame][:, pick].cpu() + shift
-            draw_skeleton(rows[row], drawn, observed=seen, linewidth=2.2)
-        word = f"\n{labels[frame]}" if labels is not None else ""
-        top = rows[line * len(views)]
-        top.text(
-            middle, 1.0, f"{(frame + first_frame) / fps:.1f} s{word}", fontsize=SMALL, color=INK,
-            ha="center", va="bottom", transform=top.get_xaxis_transform(),
-        )  # fmt: skip
-    add_legend(figure, _legend_entries(observed, None, truth, 0.9))
-    return figure
+    words = [
+        f"{(frame + first_frame) / fps:.1f} s"
+        + (f"\n{labels[frame]}" if labels is not None else "")
+        for frame in frames
+    ]
+    return partial(
+        draw_strip,
+        to_numpy(joints[frames]),
+        None if observed is None else to_numpy(observed[frames]),
+        None if truth is None else to_numpy(truth[frames]),
+        (to_numpy(low), to_numpy(high)),
+        words,
+        joint_colors(UPPER_BODY),
+        LIMBS,
+        title,
+    )
 
 
 def _check_poses(joints: Tensor) -> None:

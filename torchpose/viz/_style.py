@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from torch import Tensor
 
 from torchpose.errors import InputError, MissingDependencyError
 
@@ -25,6 +24,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1))
                             (0, (3, 1, 1, 1, 1, 1)), "-")  # fmt: skip
 SMALL, NORMAL, LARGE = 9.0, 10.0, 11.5
 _EDGE = 0.1  # inches to either side of a title
+_DPI = 150  # of pictures in pixels
 
 
 def require_matplotlib() -> None:
@@ -159,15 +159,22 @@ def join_unit(label: str, unit: str) -> str:
     return f"{label} ({unit})" if unit else label
 
 
-def to_numpy(tensor: Tensor | Any) -> Any:
+def to_numpy(tensor: Any) -> Any:
     """Return a tensor as a NumPy array in float64 (bool stays), on the CPU and out of the graph."""
     import numpy as np
 
-    array = tensor.detach().cpu().numpy() if isinstance(tensor, Tensor) else np.asarray(tensor)
+    array = tensor.detach().cpu().numpy() if hasattr(tensor, "detach") else np.asarray(tensor)
     return array if array.dtype == bool else array.astype(float)
 
 
-def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> Path:
+def png_of(figure: Figure) -> bytes:
+    """Return the file that `save_figure` would write."""
+    file = io.BytesIO()
+    figure.savefig(file, dpi=_DPI, format="png")
+    return file.getvalue()
+
+
+def save_figure(figure: Figure, path: str | Path, dpi: int = _DPI) -> Path:
     """Write a picture, atomically; the suffix gives the format (png, svg, pdf).
 
     Args:
