@@ -124,7 +124,8 @@ def run(
         method_options: the options of the method.
         face_model: video: find faces with a detector of MediaPipe (.tflite) in place of OpenCV's
             cascade; needs mediapipe.
-        workers: video: processes beside this one that look ahead in a long recording, 0 or 1.
+        workers: video: 1 for other processes, which look ahead in a long recording and draw the
+            pictures; 0 for none.
         overlay: video: write overlay.mp4 and report.html.
         pictures: draw pose_strip.png and joint_curves.png.
         given: the command.

@@ -50,7 +50,7 @@ def track_video(
     Args:
         job: of the command. options: of `VideoTracker`. face_model: file of a face detector, or None.
         overlay: whether the video and the page that show the poses are written.
-        workers: of `VideoTracker.forward`, for a recording.
+        workers: of `VideoTracker.forward`, for a recording; with 0 this process draws the pictures.
     """
     from torchpose.camera._choice import resolve_camera
     from torchpose.priors._upper_body_prior import load_prior
@@ -68,7 +68,7 @@ def track_video(
             camera = settings.hold(camera)
             tracker = _tracker(job, options, face_model, prior, camera, source.fps)
             results = stack.enter_context(track_results(job.out, job.files, pictures, overlay))
-            other = PictureProcess(pictures and source.reopenable)
+            other = PictureProcess(pictures and source.reopenable and workers > 0)
             stack.enter_context(contextlib.closing(other))
             start = time.perf_counter()
             if source.reopenable:

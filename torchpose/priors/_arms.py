@@ -159,6 +159,12 @@ def shipped_arm_prior() -> ArmPrior:
     return ArmPrior.load(_SHIPPED)
 
 
+def persons_of_shipped_arm_prior() -> tuple[str, ...]:
+    """Return the persons that the shipped prior over arms was fitted to, without making the prior."""
+    info: ArmPriorInfo = read_tensors(_SHIPPED, _KIND)[0]
+    return info.persons
+
+
 def _checked(
     together: Float[Tensor, "K K"] | None, weights: Float[Tensor, " K"]
 ) -> Float[Tensor, "K K"]:
