@@ -132,6 +132,7 @@ def _write_poses(
 ) -> list[Path]:
     """Write the poses of everybody, then what shows them: pictures, and the overlay of a recording."""
     written = results.commit(write_people(people, results.stage))
+    # without another process Python is free for the pictures for most of the time that the encoder takes
     with ThreadPoolExecutor(1) as beside:
         drawing = beside.submit(_pictures_of, people[0], results.stage, pictures, other)
         try:
