@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from typing import Any, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import numpy as np
 from beartype import BeartypeConf, beartype
@@ -104,6 +104,7 @@ class _Check:
         self.passed: set[Hashable] = set()
         source = _wrapper_source(self.signature, function.__annotations__)
         names = {"__check": self, "__passed": self.passed, "__facts_of": self.facts_of}
+        names["__types_of"] = _types_of
         exec(_compiled(source), names)
         self.wrapper_of: Callable[[Callable], types.FunctionType] = names["__wrapper_of"]  # type: ignore[assignment]
 
@@ -176,9 +177,10 @@ def _wrapper_source(signature: inspect.Signature, hints: Mapping[str, Any]) -> s
     by_name = [f"{p.name}={p.name}" for p in bare if p.kind is p.KEYWORD_ONLY]
     by_name += [f"**{p.name}" for p in bare if p.kind is p.VAR_KEYWORD]
     values = {p.name: _fact(p.name, hints.get(p.name)) for p in bare if p.name not in several}
+    values |= {p.name: _facts_of_several(p, hints) for p in bare if p.name in several}
     values["__returned"] = _fact("__returned", hints.get("return"))
     facts = [fact for fact in values.values() if fact is not None]
-    if others := [*several, *(value for value, fact in values.items() if fact is None)]:
+    if others := [value for value, fact in values.items() if fact is None]:
         facts.append(f"__facts_of({', '.join(others)})")
     return _WRAPPER.format(
         parameters=inspect.Signature(bare),
@@ -200,12 +202,40 @@ def _fact(value: str, hint: Any) -> str | None:
         kind is types.NoneType or _is_array(kind) for kind in hint.__args__
     ):
         return f"{value} is None or ({of_array})"
+    if _is_of_one_kind(hint):
+        return f"__types_of({value})"
     if get_origin(hint) is tuple:
         items = [_fact(f"{value}[{i}]", item) for i, item in enumerate(get_args(hint))]
         known = [item for item in items if item is not None]
         if len(known) == len(items):
             return ", ".join([f"type({value})", f"len({value})", *known])
     return None
+
+
+def _facts_of_several(parameter: inspect.Parameter, hints: Mapping[str, Any]) -> str | None:
+    """Return the source of what counts of all values of `*name` or `**name`, None as in `_fact`."""
+    if not _told_by_type(hints.get(parameter.name)):
+        return None
+    named = parameter.kind is parameter.VAR_KEYWORD
+    return f"(*map(type, {parameter.name}{'.values()' if named else ''}),)"
+
+
+def _is_of_one_kind(hint: Any) -> bool:
+    """Return whether a sequence has any number of items, of which the types are enough."""
+    origin, items = get_origin(hint), get_args(hint)
+    several = items[1:] == (...,) if origin is tuple else origin in (Sequence, list)
+    return several and _told_by_type(items[0])
+
+
+def _types_of(values: Sequence[Any]) -> tuple[type, ...]:
+    """Return the types of a sequence and of its items.
+
+    Raises:
+        TypeError: it is too long to be told from others by its items.
+    """
+    if len(values) > _MOST_ITEMS:
+        raise TypeError(f"more than {_MOST_ITEMS} items")
+    return (type(values), *map(type, values))
 
 
 def _is_array(hint: Any) -> bool:
@@ -243,8 +273,10 @@ def _told_by_type(hint: Any) -> bool:
     """Return whether the type of a value says all about an annotation: classes, no shapes or items."""
     if isinstance(hint, types.UnionType):
         return all(map(_told_by_type, hint.__args__))
-    if hint is None or hint is Any:
+    if hint is None or hint is Any or get_origin(hint) is Callable:
         return True
+    if isinstance(hint, TypeVar):
+        return hint.__bound__ is None and not hint.__constraints__
     return isinstance(hint, type) and not _is_array(hint)
 
 

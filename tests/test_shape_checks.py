@@ -39,6 +39,7 @@ def test_typed_error_of_the_function_wins():
 PACKAGE = '''
 """Functions whose shapes disagree on purpose."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
@@ -86,6 +87,14 @@ def turned(x: Float[Tensor, "N"], order: Literal["up", "down"]) -> str:
 
 def called(name: str, parts: list[str]) -> str:
     return name
+
+
+def summed(pick: Callable[[int], int], sizes: tuple[int, ...], *more: Any, **named: int) -> int:
+    return sum(map(pick, sizes)) if callable(pick) else 0
+
+
+def counted(parts: Sequence[int | None]) -> int:
+    return len(parts)
 
 
 @dataclass
@@ -175,6 +184,26 @@ def test_words_are_told_apart_where_an_annotation_lists_them(package):
     for bad in ((1, ["b"]), ("a", [1]), (None, ["b"])):
         with pytest.raises(TypeCheckError):
             package.called(*bad)
+
+
+def test_functions_and_any_number_of_items_are_checked_by_their_types(package):
+    def pick(value):
+        return 1
+
+    for _ in range(2):
+        assert package.summed(pick, (1, 2, 3), "a", object(), n=1) == 3
+    assert package.summed(abs, (-4,), torch.zeros(2)) == 4
+    for bad in ((pick, ["1"]), (pick, ("1", "2")), (3, (1,))):
+        with pytest.raises(TypeCheckError):
+            package.summed(*bad, "a", n=1)
+    with pytest.raises(TypeCheckError):
+        package.summed(pick, (1, 2), n="1")
+    for _ in range(2):
+        assert package.counted([1, None]) == package.counted((1, None)) == 2
+        assert package.counted([None] * 40) == 40
+    for bad in (["1", "2"], ("1",), {1, 2}, ["1"] * 40):
+        with pytest.raises(TypeCheckError):
+            package.counted(bad)
 
 
 def test_defaults_are_passed_on_and_marks_among_them_are_no_values(package):
