@@ -159,7 +159,7 @@ def test_errors_are_those_that_were_made(three):
 )
 @pytest.mark.parametrize("cameras", [2, 3])
 def test_a_pose_of_another_convention_of_one_camera_is_said(word, change, cameras):
-    one = scene(cameras, n_frames=14)
+    one = scene(cameras, n_frames=7)
     rig = with_pose(one.rig, change)
     try:
         notes = BodyTracker(rig, "kalman", fps=FPS)(keypoints=one.keypoints, names=NAMES).notes

@@ -90,6 +90,7 @@ def test_turns_are_found_and_keypoints_turned_back(three):
     assert float((back.pixels - frame.pixels).abs().max()) < 1.5
 
 
+@pytest.mark.usefixtures("undoubted_here")
 @pytest.mark.parametrize("degrees", [1.5, 20.0])
 def test_a_turned_camera_of_three_hardly_moves_the_body(three, degrees):
     found = track(three.keypoints[:14], with_turn(three.rig, 1, degrees))
@@ -97,6 +98,7 @@ def test_a_turned_camera_of_three_hardly_moves_the_body(three, degrees):
     assert any(f"camera c1 (by {degrees:.0f}"[:-1] in note for note in found.notes)
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_cameras_that_are_all_turned_agree_again(three):
     rig = three.rig
     for camera, degrees in enumerate((3.0, -3.0, 3.0)):
@@ -229,6 +231,7 @@ def test_right_cameras_stay_as_they_are(three):
     assert found.notes == () and not found.respread.any()
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_camera_that_stands_still_is_not_used(three):
     keypoints, joints = three.keypoints[:14].clone(), three.joints[:14]
     keypoints[8:, 2] = keypoints[8, 2]
@@ -243,6 +246,7 @@ def test_a_camera_that_stands_still_is_not_used(three):
     torch.testing.assert_close(live.joints3d[0], found.joints3d[11])
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_what_is_refined_leaves_wrong_cameras_out():
     seen = scene(4, n_frames=14)
     keypoints = seen.keypoints.clone()
@@ -257,6 +261,7 @@ def test_what_is_refined_leaves_wrong_cameras_out():
     assert not any("no keypoint of this person" in note for note in found.notes)
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_what_is_refined_begins_with_the_turns_that_tracking_finds(three):
     said = with_turn(three.rig, 1, 6.0)
     tracker = BodyTracker(said, "kalman", fps=FPS)
@@ -289,6 +294,7 @@ def test_everything_that_stands_still_is_used(three):
     assert bool((without_still(frame, frame.pixels, frame.inlier).inlier > 0).all())
 
 
+@pytest.mark.usefixtures("undoubted_here")
 def test_a_camera_that_sees_somebody_else_is_left_out_and_comes_back():
     seen = scene(4, n_frames=38)
     keypoints, other = seen.keypoints.clone(), scene(4, n_frames=38, height=1.1)
