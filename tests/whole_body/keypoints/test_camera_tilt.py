@@ -1,5 +1,7 @@
 """Lifted bodies are upright where gravity is known, and people who stand tell how a camera is held."""
 
+import copy
+import functools
 import math
 
 import pytest
@@ -29,7 +31,7 @@ def camera_of(pitch: float = 0.0, roll: float = 0.0) -> PinholeCamera:
 def standing_body() -> torch.Tensor:
     """Somebody who looks at the camera and leans a little ahead, as people do who stand."""
     lean = rotvec_to_matrix(torch.tensor([math.radians(4.0), 0.0, 0.0], dtype=torch.float64))
-    return moving_body() @ lean.T
+    return moving_body(24) @ lean.T
 
 
 def seen_by(camera: PinholeCamera, aimed: bool = False) -> torch.Tensor:
@@ -42,6 +44,12 @@ def seen_by(camera: PinholeCamera, aimed: bool = False) -> torch.Tensor:
 def tracked(pixels: torch.Tensor, camera: PinholeCamera, up: str | None = None) -> BodyTrack:
     tracker = torchpose.BodyTracker([camera], "kalman", fps=FPS, up=up)
     return tracker(keypoints=pixels, names=NAMES)
+
+
+@functools.cache
+def standing_before(pitch: float = 0.0, roll: float = 0.0) -> BodyTrack:
+    """The track of somebody who stands before a tilted camera that is said to be level."""
+    return tracked(seen_by(camera_of(pitch, roll)), camera_of())
 
 
 @pytest.mark.parametrize("elevation", [-25.0, 0.0, 15.0])
@@ -73,9 +81,8 @@ def _relative() -> torch.Tensor:
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (12.0, 0.0), (12.0, 8.0), (0.0, -8.0)])
 def test_somebody_who_stands_tells_how_the_camera_is_held(pitch, roll):
-    level = camera_of()
-    track = tracked(seen_by(camera_of(pitch, roll)), level)
-    found = find_camera_tilt([track, track], CameraRig([level]))
+    track = standing_before(pitch, roll)
+    found = find_camera_tilt([track, track], CameraRig([camera_of()]))
     assert found is not None
     angles = [math.degrees(angle) for angle in found]
     assert angles[0] == pytest.approx(pitch, abs=5.0) and angles[1] == pytest.approx(roll, abs=2.0)
@@ -96,7 +103,7 @@ def test_who_hides_the_legs_or_sits_tells_nothing():
     pixels = seen_by(level)
     pixels[..., LEGS, :] = torch.nan
     assert find_camera_tilt([tracked(pixels, level)], CameraRig([level])) is None
-    track = tracked(seen_by(level), level)
+    track = copy.copy(standing_before())
     sitting = track.joints3d.clone()
     ahead = torch.tensor([0.0, 0.4, 0.4]).to(sitting)
     sitting[:, LEGS] += ahead
@@ -107,7 +114,7 @@ def test_who_hides_the_legs_or_sits_tells_nothing():
 def test_a_tracker_finds_the_tilt_of_its_only_camera():
     camera = camera_of()
     tracker = torchpose.BodyTracker([camera], "kalman", fps=FPS)
-    track = tracker(keypoints=seen_by(camera_of(12.0)), names=NAMES)
+    track = standing_before(12.0)
     assert isinstance(found := tracker.find_tilt([track]), CameraTilt)
     assert found == find_camera_tilt([track], CameraRig([camera]))
     assert tracker.find_tilt([]) is None
