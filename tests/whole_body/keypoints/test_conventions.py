@@ -79,6 +79,9 @@ def test_other_conventions_are_refused_of_several_persons_too(seen, word):
     rig = rig_of_poses(seen.rig, POSES[word])
     with pytest.raises(CameraError, match=word):
         track(rig, seen.keypoints[:, :, None], persons="all")
+
+
+def test_keypoints_of_other_images_are_refused_of_several_persons_too(seen):
     upside_down = torch.stack(PIXELS["from the lower edge"](*seen.keypoints.unbind(-1)), -1)
     with pytest.raises(CameraError, match="from the lower edge"):
         track(seen.rig, upside_down[:, :, None], persons="all")
