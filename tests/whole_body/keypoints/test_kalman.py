@@ -175,13 +175,15 @@ def _with_wild_wrist(four, away):
     return keypoints
 
 
-def _with_exchanged_legs(four):
-    keypoints = four.keypoints.clone()
-    legs = [
-        J(f"{side}_{joint}") for side in ("left", "right") for joint in ("hip", "knee", "ankle")
-    ]
-    mirrored = [*legs[3:], *legs[:3]]
-    keypoints[15:20, 2, legs] = four.keypoints[15:20, 2, mirrored]
+BOTH_LEGS = [
+    J(f"{side}_{joint}") for side in ("left", "right") for joint in ("hip", "knee", "ankle")
+]
+
+
+def _with_exchanged_legs(seen, camera=2, frames=slice(15, 20)):
+    keypoints = seen.keypoints.clone()
+    mirrored = [*BOTH_LEGS[3:], *BOTH_LEGS[:3]]
+    keypoints[frames, camera][:, BOTH_LEGS] = seen.keypoints[frames, camera][:, mirrored]
     return keypoints
 
 
@@ -246,6 +248,48 @@ def test_a_person_who_went_away_is_found_elsewhere(spoiled):
     joints, found = spoiled["elsewhere"]
     assert found.coasting[15:25].all() and not found.coasting[25:].any()
     assert float(errors(found, joints)[-1].mean()) < 0.03
+
+
+@pytest.fixture(scope="module")
+def misled():
+    """What was there, and the track, of two cameras that mislead: both are tracked in one batch."""
+    two = scene(2, 12)
+    cases = {
+        "forearm": _with_a_forearm_along_the_view(two),
+        "legs": (two.joints, _with_exchanged_legs(two, 0, slice(0, 3))),
+    }
+    keypoints = torch.stack([seen for _, seen in cases.values()])
+    confidence = two.confidence.expand(len(cases), -1, -1, -1)
+    tracks = tracker(two.rig)(keypoints=keypoints, confidence=confidence)
+    return {
+        name: (joints, found)
+        for (name, (joints, _)), found in zip(cases.items(), tracks, strict=True)
+    }
+
+
+def _with_a_forearm_along_the_view(two):
+    """A forearm that points away from the first camera instead of towards it, which looks the same there."""
+    wrist, elbow = J("left_wrist"), J("left_elbow")
+    joints = two.joints.clone()
+    place = -two.rig.rotation[0].mT @ two.rig.translation[0]
+    ray = torch.nn.functional.normalize(joints[4:, wrist] - place, dim=-1)
+    depth = ((joints[4:, wrist] - joints[4:, elbow]) * ray).sum(-1, keepdim=True)
+    joints[4:, wrist] -= 2 * depth * ray
+    return joints, two.keypoints + two.rig(joints).pixels - two.rig(two.joints).pixels
+
+
+def test_a_joint_is_found_where_two_cameras_agree_though_one_had_it_elsewhere(misled):
+    joints, found = misled["forearm"]
+    wrong = errors(found, joints)[:, J("left_wrist")]
+    assert float(wrong[4]) > 0.1 and float(wrong[8:].max()) < 0.05
+    assert (found.details["inlier"][8:, :, J("left_wrist")] > 0.9).all()
+
+
+def test_legs_that_began_on_the_wrong_sides_are_turned_back(misled):
+    joints, found = misled["legs"]
+    legs = errors(found, joints)[:, BOTH_LEGS].mean(-1)
+    assert float(legs[2]) > 0.06 and float(legs[7:].max()) < 0.03
+    assert (found.details["exchanged"][7:] < 0.1).all()
 
 
 @pytest.fixture(scope="module")

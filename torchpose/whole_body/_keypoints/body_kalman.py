@@ -339,6 +339,25 @@ class BodyKalmanFilter(nn.Module):
         again = self._iterated(wide, readings_of(frame, self.exchange), _RECOVERY)
         return replaced(corrected, rows, again._replace(widened=widened))
 
+    def turned_back(
+        self,
+        corrected: CorrectedBody,
+        state: BodyGaussian,
+        frame: KeypointFrame,
+        wrong: Bool[Tensor, "B C 2"],
+    ) -> CorrectedBody:
+        """Return the posteriors; limbs that are on the wrong side begin from a prediction that is wide there.
+
+        Args:
+            corrected: of all elements. state: the prediction. frame: the keypoints.
+            wrong: the cameras in which arms and legs are taken for exchanged, and are not.
+        """
+        rows = wrong.flatten(1).any(-1).nonzero().squeeze(-1)
+        limbs = wrong.any(1).to(state.cov) @ self.exchange.groups.to(state.cov) > 0
+        log_odds = state.log_odds.masked_fill(wrong, math.log(self.transition.begin))
+        state = state._replace(log_odds=log_odds, doubt=corrected.state.doubt)
+        return self._recovered(corrected, state, frame, limbs, rows)
+
     def _iterated(
         self,
         state: BodyGaussian,
@@ -477,6 +496,39 @@ class BodyKalmanFilter(nn.Module):
         at_large = weigh(
             readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )
-        doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
+        elsewhere = at_large.log_joint.sum(-2)
+        rejected = ((readings.inlier[0] > 0) & (found.weighed.inlier < 0.5)).any(-2)
+        if len(self.maps.shift) > 1 and bool(rejected.any()):
+            agreed = self._log_evidence_where_agreed(state, readings, far)
+            elsewhere = torch.where(rejected, torch.maximum(elsewhere, agreed), elsewhere)
+        doubt = state.doubt + elsewhere - found.weighed.log_joint.sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
+
+    def _log_evidence_where_agreed(
+        self, state: BodyGaussian, readings: KeypointFrame, far: Float[Tensor, "B J 3 3"]
+    ) -> Float[Tensor, "B J"]:
+        """Return the log-evidence of keypoints for joints that are where cameras agree, -inf where none do.
+
+        A joint may be off along the ray of one camera, which then takes it for right, while another one
+        rejects it. Only both together tell where it is: by Laplace's approximation about that place t,
+
+            log p(z | t) - (t - p)^T S^-1 (t - p) / 2 - log |1 + S W| / 2,
+
+        with the predicted p, its covariance S and the information W of the keypoints.
+
+        Args:
+            state: the prediction. readings: the keypoints. far: S, of joints that are elsewhere.
+        """
+        predicted = self.articulation.joints(state.mean)
+        place = triangulate(self.maps, readings.map(lambda value: value[0]))
+        known = place.isfinite().all(-1)
+        place = torch.where(known[..., None], place, predicted)
+        seen = see(self.maps, place)
+        weighed = weigh(readings, seen, self.maps, state.beliefs, self.exchange)
+        W, _ = information(readings, seen, weighed)
+        L = torch.linalg.cholesky(far)
+        off = torch.linalg.solve_triangular(L, (place - predicted)[..., None], upper=False)
+        spread = torch.linalg.cholesky(plus_one(L.mT @ W @ L)).diagonal(dim1=-2, dim2=-1).log()
+        fit = -0.5 * off.square().sum((-2, -1)) - spread.sum(-1)
+        return (weighed.log_joint.sum(-2) + fit).masked_fill(~known, -math.inf)

@@ -25,6 +25,7 @@ class KeypointStream(NamedTuple):
         spread: [B, J], metres, standard deviations of the network's joints in the last frame that it lifted.
         unseen: [B, J], seconds since a keypoint was a joint's, infinite where none has been.
         coasting: [B], of whom nothing was measured in the last frame.
+        own_sides: [B, C, 2], of `evidence_of_own_sides`.
     """
 
     state: BodyGaussian
@@ -37,6 +38,7 @@ class KeypointStream(NamedTuple):
     spread: Tensor
     unseen: Tensor
     coasting: Tensor
+    own_sides: Tensor
 
 
 class KeypointPoses(NamedTuple):

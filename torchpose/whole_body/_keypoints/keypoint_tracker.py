@@ -41,6 +41,7 @@ from torchpose.whole_body._keypoints.keypoint_poses import (
 )
 from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
 from torchpose.whole_body._keypoints.known_person import of_one_camera
+from torchpose.whole_body._keypoints.lasting_exchange import are_wrong, evidence_of_own_sides
 from torchpose.whole_body._keypoints.lifted_pose import (
     LifterMemory,
     PoseLifter,
@@ -222,6 +223,7 @@ class KeypointTracker(nn.Module):
             found.state, begun, torch.zeros_like(count), torch.full_like(begun, NOBODY, dtype=torch.long),
             memory, CameraFaults.none(frame), SizeBelief.usual(self.size_std, count),
             torch.zeros_like(never), never, torch.zeros_like(begun),
+            torch.zeros_like(found.state.log_odds),
         )  # fmt: skip
         return self._with_lifted(stream, lifted, found), found, begun
 
@@ -238,6 +240,8 @@ class KeypointTracker(nn.Module):
         else:
             likely = corrected_by(lifted, self.filter, predicted)
         found = self.filter.correct(likely, frame)
+        if len(self._rig[0]) > 1:
+            stream, found = self._with_own_sides(stream, likely, frame, found)
         due = ~stream.begun | are_lost(stream.lost, self.filter.fps)
         if lifted is not None:
             due = due | contradicts(lifted, self.filter, predicted)
@@ -255,6 +259,20 @@ class KeypointTracker(nn.Module):
         if lifted is None:
             stream = stream._replace(unseen=stream.unseen.masked_fill(due[:, None], torch.inf))
         return self._with_lifted(stream, lifted, found), found, due
+
+    def _with_own_sides(
+        self,
+        stream: KeypointStream,
+        predicted: BodyGaussian,
+        frame: KeypointFrame,
+        found: CorrectedBody,
+    ) -> tuple[KeypointStream, CorrectedBody]:
+        """Return what was found, with limbs turned back that were on the wrong side of the body."""
+        evidence = evidence_of_own_sides(self.filter, frame, found, stream.lost, stream.own_sides)
+        wrong = are_wrong(evidence)
+        if bool(wrong.any()):
+            found = self.filter.turned_back(found, predicted, frame, wrong)
+        return stream._replace(own_sides=evidence.masked_fill(wrong, 0.0)), found
 
     # --- one of several cameras -------------------------------------------------------------------
 
