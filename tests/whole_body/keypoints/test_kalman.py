@@ -253,7 +253,7 @@ def test_a_person_who_went_away_is_found_elsewhere(spoiled):
 @pytest.fixture(scope="module")
 def misled():
     """What was there, and the track, of two cameras that mislead: both are tracked in one batch."""
-    two = scene(2, 12)
+    two = scene(2, 20)
     cases = {
         "forearm": _with_a_forearm_along_the_view(two),
         "legs": (two.joints, _with_exchanged_legs(two, 0, slice(0, 3))),
@@ -269,20 +269,20 @@ def misled():
 
 def _with_a_forearm_along_the_view(two):
     """A forearm that points away from the first camera instead of towards it, which looks the same there."""
-    wrist, elbow = J("left_wrist"), J("left_elbow")
+    wrist, elbow = J("right_wrist"), J("right_elbow")
     joints = two.joints.clone()
     place = -two.rig.rotation[0].mT @ two.rig.translation[0]
-    ray = torch.nn.functional.normalize(joints[4:, wrist] - place, dim=-1)
-    depth = ((joints[4:, wrist] - joints[4:, elbow]) * ray).sum(-1, keepdim=True)
-    joints[4:, wrist] -= 2 * depth * ray
+    ray = torch.nn.functional.normalize(joints[12:, wrist] - place, dim=-1)
+    depth = ((joints[12:, wrist] - joints[12:, elbow]) * ray).sum(-1, keepdim=True)
+    joints[12:, wrist] -= 2 * depth * ray
     return joints, two.keypoints + two.rig(joints).pixels - two.rig(two.joints).pixels
 
 
 def test_a_joint_is_found_where_two_cameras_agree_though_one_had_it_elsewhere(misled):
     joints, found = misled["forearm"]
-    wrong = errors(found, joints)[:, J("left_wrist")]
-    assert float(wrong[4]) > 0.1 and float(wrong[8:].max()) < 0.05
-    assert (found.details["inlier"][8:, :, J("left_wrist")] > 0.9).all()
+    wrong = errors(found, joints)[:, J("right_wrist")]
+    assert float(wrong[12]) > 0.1 and float(wrong[16:].max()) < 0.05
+    assert (found.details["inlier"][16:, :, J("right_wrist")] > 0.9).all()
 
 
 def test_legs_that_began_on_the_wrong_sides_are_turned_back(misled):
