@@ -497,10 +497,11 @@ class BodyKalmanFilter(nn.Module):
             readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )
         elsewhere = at_large.log_joint.sum(-2)
-        rejected = ((readings.inlier[0] > 0) & (found.weighed.inlier < 0.5)).any(-2)
-        if len(self.maps.shift) > 1 and bool(rejected.any()):
+        there, accepted = readings.inlier[0] > 0, found.weighed.inlier > 0.5
+        unsure = (there.sum(-2) > 1) & (accepted.sum(-2) < 2)
+        if bool(unsure.any()):
             agreed = self._log_evidence_where_agreed(state, readings, far)
-            elsewhere = torch.where(rejected, torch.maximum(elsewhere, agreed), elsewhere)
+            elsewhere = torch.where(unsure, torch.maximum(elsewhere, agreed), elsewhere)
         doubt = state.doubt + elsewhere - found.weighed.log_joint.sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped

@@ -40,10 +40,11 @@ def evidence_of_own_sides(
         lost: of `frames_lost` before this frame; each frame of exchanged sides counts a half.
         before: the same evidence, of the frames up to this one.
     """
-    exchanged = found.weighed.exchanged > 0.5
+    exchanged, after = found.weighed.exchanged > 0.5, torch.zeros_like(before)
+    if not bool(exchanged.any()):
+        return after
     due = ((lost + 0.5) % _EVERY == _FIRST)[:, None, None] | (before > 0)
     places = (exchanged & due & _few_see(filter, frame)[:, None]).nonzero()
-    after = torch.zeros_like(before)
     if not len(places):
         return after
     as_is = frame.take(places[:, 0])
