@@ -56,6 +56,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     see,
     squared_errors,
     weigh,
+    with_sides_exchanged,
 )
 from torchpose.whole_body._keypoints.nested import replaced, taken
 from torchpose.whole_body._keypoints.upright import (
@@ -314,7 +315,10 @@ class BodyKalmanFilter(nn.Module):
         state = state._replace(doubt=doubt)
         corrected = self._iterated(state, readings, (1.0,) * self.n_iterations, found)
         rows = jumped.any(-1).nonzero().squeeze(-1)
-        return self._recovered(corrected, state, frame, jumped, rows) if len(rows) else corrected
+        if not len(rows):
+            return corrected
+        exchanged = corrected.weighed.exchanged
+        return self._recovered(corrected, state, frame, jumped, rows, exchanged)
 
     def _recovered(
         self,
@@ -323,19 +327,24 @@ class BodyKalmanFilter(nn.Module):
         frame: KeypointFrame,
         jumped: Bool[Tensor, "B J"],
         rows: Int[Tensor, " N"],
+        exchanged: Float[Tensor, "B C 2"],
     ) -> CorrectedBody:
         """Return the posteriors, of elements with jumped joints from a prediction that is wide there.
 
         Limbs to such joints begin where cameras agree that they are, since none is found by small steps that
-        points the other way.
+        points the other way. While the noise is wide, `exchanged` alone tells which sides keypoints are of.
         """
         widened = (jumped[rows].to(state.cov) @ self.articulation.carriers) * self._jump_variance
         wide = taken(state, rows)
         frame = frame.take(rows)
-        joints = triangulate(self.maps, frame)
+        exchanged = exchanged[rows]
+        sided = with_sides_exchanged(frame, exchanged > 0.5, self.exchange)
+        joints = triangulate(self.maps, sided)
         seen = jumped[rows] & joints.isfinite().all(-1)
         mean = self.articulation.swung(wide.mean, joints.nan_to_num(), seen)
-        wide = wide._replace(mean=mean, cov=wide.cov + torch.diag_embed(widened))
+        log_odds = torch.logit(exchanged, _ODDS)
+        cov = wide.cov + torch.diag_embed(widened)
+        wide = wide._replace(mean=mean, cov=cov, log_odds=log_odds)
         again = self._iterated(wide, readings_of(frame, self.exchange), _RECOVERY)
         return replaced(corrected, rows, again._replace(widened=widened))
 
@@ -354,9 +363,9 @@ class BodyKalmanFilter(nn.Module):
         """
         rows = wrong.flatten(1).any(-1).nonzero().squeeze(-1)
         limbs = wrong.any(1).to(state.cov) @ self.exchange.groups.to(state.cov) > 0
-        log_odds = state.log_odds.masked_fill(wrong, math.log(self.transition.begin))
-        state = state._replace(log_odds=log_odds, doubt=corrected.state.doubt)
-        return self._recovered(corrected, state, frame, limbs, rows)
+        exchanged = corrected.weighed.exchanged.masked_fill(wrong, self.transition.begin)
+        state = state._replace(doubt=corrected.state.doubt)
+        return self._recovered(corrected, state, frame, limbs, rows, exchanged)
 
     def _iterated(
         self,
@@ -500,14 +509,20 @@ class BodyKalmanFilter(nn.Module):
         there, accepted = readings.inlier[0] > 0, found.weighed.inlier > 0.5
         unsure = (there.sum(-2) > 1) & (accepted.sum(-2) < 2)
         if bool(unsure.any()):
-            agreed = self._log_evidence_where_agreed(state, readings, far)
+            agreed = self._log_evidence_where_agreed(
+                state, readings, far, found.weighed.exchanged > 0.5
+            )
             elsewhere = torch.where(unsure, torch.maximum(elsewhere, agreed), elsewhere)
         doubt = state.doubt + elsewhere - found.weighed.log_joint.sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
 
     def _log_evidence_where_agreed(
-        self, state: BodyGaussian, readings: KeypointFrame, far: Float[Tensor, "B J 3 3"]
+        self,
+        state: BodyGaussian,
+        readings: KeypointFrame,
+        far: Float[Tensor, "B J 3 3"],
+        exchanged: Bool[Tensor, "B C 2"],
     ) -> Float[Tensor, "B J"]:
         """Return the log-evidence of keypoints for joints that are where cameras agree, -inf where none do.
 
@@ -520,9 +535,11 @@ class BodyKalmanFilter(nn.Module):
 
         Args:
             state: the prediction. readings: the keypoints. far: S, of joints that are elsewhere.
+            exchanged: sides, by the prediction.
         """
         predicted = self.articulation.joints(state.mean)
-        place = triangulate(self.maps, readings.map(lambda value: value[0]))
+        frame = readings.map(lambda value: value[0])
+        place = triangulate(self.maps, with_sides_exchanged(frame, exchanged, self.exchange))
         known = place.isfinite().all(-1)
         place = torch.where(known[..., None], place, predicted)
         seen = see(self.maps, place)

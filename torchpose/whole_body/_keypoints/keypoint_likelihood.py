@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.body._skeleton import BodySkeleton, other_side
@@ -145,6 +145,24 @@ def readings_of(frame: KeypointFrame, exchange: Exchange) -> KeypointFrame:
     """Return both readings of keypoints, [2, B, ...]: as of their own joints, and as of the other side's."""
     mirror = exchange.mirror
     return frame.map(lambda value: torch.stack([value, value.index_select(2, mirror)]))
+
+
+def with_sides_exchanged(
+    frame: KeypointFrame, exchanged: Bool[Tensor, "B C 2"], exchange: Exchange
+) -> KeypointFrame:
+    """Return keypoints with left and right of some arms and legs exchanged.
+
+    Args:
+        frame: the keypoints. exchanged: of which cameras and groups of joints. exchange: the groups.
+    """
+    groups, mirror = exchange.groups, exchange.mirror
+    chosen = exchanged.to(groups) @ groups > 0
+
+    def sided(value: Tensor) -> Tensor:
+        rows = chosen[..., None] if value.ndim > chosen.ndim else chosen
+        return torch.where(rows, value.index_select(2, mirror), value)
+
+    return frame.map(sided)
 
 
 def see(maps: RigMaps, joints: Float[Tensor, "B J 3"]) -> Seen:

@@ -6,11 +6,11 @@ and the pose of a body that begins in it: with the keypoints as they are, or wit
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, CorrectedBody
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, with_sides_exchanged
 from torchpose.whole_body._keypoints.keypoint_start import start
 
 _FIRST, _EVERY = (
@@ -48,7 +48,10 @@ def evidence_of_own_sides(
     if not len(places):
         return after
     as_is = frame.take(places[:, 0])
-    pairs = zip(as_is, _other_sides(filter, as_is, places), strict=True)
+    rows, camera, limb = torch.arange(len(places), device=places.device), *places[:, 1:].T
+    other = torch.zeros_like(exchanged[places[:, 0]])
+    other[rows, camera, limb] = True
+    pairs = zip(as_is, with_sides_exchanged(as_is, other, filter.exchange), strict=True)
     both = KeypointFrame(*(torch.cat(pair) for pair in pairs))
     own, other = start(filter, both, _HEADINGS).log_evidence.chunk(2)
     at = tuple(places.T)
@@ -66,23 +69,3 @@ def _few_see(filter: BodyKalmanFilter, frame: KeypointFrame) -> Bool[Tensor, "B 
     groups = filter.exchange.groups
     share = (frame.inlier > 0).to(groups) @ groups.mT / groups.sum(-1)
     return (share >= _SEEN).sum(1) <= _MOST_CAMERAS
-
-
-def _other_sides(
-    filter: BodyKalmanFilter, frame: KeypointFrame, places: Int[Tensor, "N 3"]
-) -> KeypointFrame:
-    """Return frames [N, ...] with the sides of one limb of one camera exchanged.
-
-    Args:
-        places: of each its element of the batch, camera and limb.
-    """
-    _, camera, limb = places.T
-    n_cameras = frame.inlier.shape[1]
-    there = torch.arange(n_cameras, device=camera.device) == camera[:, None]
-    chosen = there[..., None] & (filter.exchange.groups[limb] > 0)[:, None]
-
-    def exchanged(value: Tensor) -> Tensor:
-        rows = chosen[..., None] if value.ndim > chosen.ndim else chosen
-        return torch.where(rows, value.index_select(2, filter.exchange.mirror), value)
-
-    return frame.map(exchanged)
