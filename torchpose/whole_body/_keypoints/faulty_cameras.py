@@ -28,7 +28,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     squared_errors,
     weigh,
 )
-from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
 from torchpose.whole_body._keypoints.nested import replaced, taken
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, free_turns, looked_again
 from torchpose.whole_body._keypoints.turned_cameras import (
@@ -170,7 +170,9 @@ def find_faults(
         filter: that tracks on. frame: keypoints as they were detected. faults: that were known so far.
         begun: who has just begun with these, if all have.
     """
-    known = start(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
+    known = (
+        start_with_sides(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
+    )
     least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) - unlikely(faults.turn)
     tried = _explanations(frame, filter.maps)
     count, n = tried.price.shape
@@ -178,7 +180,7 @@ def find_faults(
     turn, off = tried.turn.flatten(0, 1), tried.off.flatten(0, 1)
     given = frame.take(every.repeat_interleave(n))
     right = _righted(given, turn, off, filter.maps)
-    found = start(filter, right, _HEADINGS)
+    found = start_with_sides(filter, right, _HEADINGS)
     evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
     wrong = any_wrong(off, turn)
     refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)

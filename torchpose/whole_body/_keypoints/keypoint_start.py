@@ -23,13 +23,18 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    KeypointFrame,
+    RigMaps,
+    with_sides_exchanged,
+)
 from torchpose.whole_body._keypoints.known_person import with_usual_trunk
 from torchpose.whole_body._keypoints.lifted_pose import corrected_by
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.nested import replaced, taken
 
 _HEADINGS = 8
+_FEW_HEADINGS = 2  # where shoulders or hips tell which way the body faces
 _WIDTHS = (
     400.0,
     200.0,
@@ -56,18 +61,53 @@ _SIDED = ("shoulder", "hip")
 _LEAST_WIDTH = 0.05  # metres between left and right that tell a direction
 
 
-def start(
-    filter: BodyKalmanFilter, frame: KeypointFrame, n_headings: int = _HEADINGS
-) -> CorrectedBody:
+def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
     """Return the likeliest starts of B persons whom several cameras see.
 
+    Of two cameras, one that exchanges left and right of arms or legs looks like a body that has them the
+    wrong way round, so starts with exchanged sides are tried too.
+
     Args:
-        filter: that tracks on. frame: the first keypoints. n_headings: that are tried.
+        filter: that tracks on. frame: the first keypoints.
     """
-    joints = triangulate(filter.maps, frame)
+    found = start_with_sides(filter, frame)
+    n_cameras = len(filter.maps.shift)
+    if n_cameras != 2:
+        return found
+    tried = torch.eye(2 * n_cameras, dtype=torch.bool, device=frame.inlier.device)
+    tried = tried.view(-1, n_cameras, 2)
+    for sides in tried:
+        exchanged = sides.expand(len(frame.inlier), -1, -1)
+        other = start_with_sides(filter, frame, _FEW_HEADINGS, exchanged)
+        better = other.log_evidence + _LOG_ODDS > found.log_evidence
+        rows = better.nonzero().squeeze(-1)
+        if len(rows):
+            found = replaced(found, rows, taken(other, rows))
+    return found
+
+
+def start_with_sides(
+    filter: BodyKalmanFilter,
+    frame: KeypointFrame,
+    n_headings: int = _HEADINGS,
+    exchanged: Bool[Tensor, "B C 2"] | None = None,
+) -> CorrectedBody:
+    """Return the likeliest starts with keypoints that are expected to be of some sides.
+
+    Args:
+        filter, frame: as of `start`. n_headings: that are tried.
+        exchanged: sides of arms and legs in each camera; none are if None.
+    """
+    sided = frame
+    if exchanged is not None:
+        sided = with_sides_exchanged(frame, exchanged, filter.exchange)
+    joints = triangulate(filter.maps, sided)
     state = _begun(filter, joints, joints.isfinite().all(-1), n_headings)
     every = torch.arange(len(joints), device=joints.device)
-    frames = frame.take(every.repeat_interleave(n_headings))
+    rows = every.repeat_interleave(n_headings)
+    if exchanged is not None:
+        state = state._replace(log_odds=state.log_odds.where(~exchanged[rows], -_LOG_ODDS))
+    frames = frame.take(rows)
     state = _with_trunks(filter, state, filter.without_hips(frames))
     found = filter.correct(state, frames, _WIDTHS)
     best = every * n_headings + found.log_evidence.view(-1, n_headings).argmax(-1)

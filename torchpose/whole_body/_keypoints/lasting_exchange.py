@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, with_sides_exchanged
-from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
 
 _FIRST, _EVERY = (
     1.0,
@@ -53,7 +53,7 @@ def evidence_of_own_sides(
     other[rows, camera, limb] = True
     pairs = zip(as_is, with_sides_exchanged(as_is, other, filter.exchange), strict=True)
     both = KeypointFrame(*(torch.cat(pair) for pair in pairs))
-    own, other = start(filter, both, _HEADINGS).log_evidence.chunk(2)
+    own, other = start_with_sides(filter, both, _HEADINGS).log_evidence.chunk(2)
     at = tuple(places.T)
     gain = (own - other).clamp_max(_MOST_GAIN)
     return after.index_put(at, torch.where(gain > _LEAST_GAIN, before[at] + gain, 0.0))

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.faulty_cameras import LEAST_CAMERAS
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_start import start
+from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
 from torchpose.whole_body._keypoints.people_association import (
     group_detections,
     owned_detections,
@@ -90,6 +90,6 @@ def _evidence(
     nobodys = ~owned_detections(groups, len(frame.inlier)).mT[..., None] & (frame.inlier > 0)
     evidence = -float((nobodys * filter.maps.log_area[:, None]).sum())
     if len(groups):
-        found = start(filter, taken_detections(right, groups), _HEADINGS)
+        found = start_with_sides(filter, taken_detections(right, groups), _HEADINGS)
         evidence += float(found.log_evidence.sum())
     return evidence
