@@ -36,7 +36,7 @@ from torchpose.whole_body._keypoints.upright import axes_of
 
 __all__ = ["add_desk_table", "desk_clips"]
 
-_CAMERAS, _FRAMES, _QUICK_FRAMES = 2, 60, 30
+_CAMERAS, _FRAMES, _QUICK_FRAMES = 2, 60, 16
 _SITTING = "people who sit"
 _NECK = BODY_15.joint("neck")
 _SHOULDERS, _HIPS, _KNEES, _ANKLES = (

@@ -23,6 +23,7 @@ import torchpose
 from benchmarks.keypoint_bodies.clips import (
     KINECT,
     KINECT_SCORED,
+    MHAD,
     SCORED,
     detect,
     hips_for_pelvis,
@@ -130,10 +131,11 @@ def add_tilt_tables(
 
 def _bodies(data: Path, quick: bool) -> dict[str, dict[str, Tensor]]:
     """Return joints [T, 15, 3] to the person's left, up and ahead, by group and name."""
+    scored = {MHAD: SCORED[MHAD][:1]} if quick else SCORED
     mocap = {
         f"{folder} {clip.trial}": _levelled(clip.joints, clip.up, clip.fps, quick)
-        for folder, names in SCORED.items()
-        for clip in recorded(data / folder, names[:1] if quick else names[::_EVERY])
+        for folder, names in scored.items()
+        for clip in recorded(data / folder, names[::_EVERY])
     }
     names = KINECT_SCORED[:1] if quick else KINECT_SCORED[::_KINECT_EVERY]
     kinect = {
