@@ -240,7 +240,7 @@ class KeypointTracker(nn.Module):
         else:
             likely = corrected_by(lifted, self.filter, predicted)
         found = self.filter.correct(likely, frame)
-        if len(self._rig[0]) > 1:
+        if lifted is None:  # else a network knows the sides
             stream, found = self._with_own_sides(stream, likely, frame, found)
         due = ~stream.begun | are_lost(stream.lost, self.filter.fps)
         if lifted is not None:

@@ -13,10 +13,8 @@ from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, Correc
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, with_sides_exchanged
 from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
 
-_FIRST, _EVERY = (
-    1.0,
-    1.5,
-)  # of `frames_lost`: in the second frame of exchanged sides, and every third
+# Values of `frames_lost`: in the second frame of exchanged sides, and every third after it.
+_FIRST, _EVERY = 1.0, 1.5
 _LEAST_GAIN = 5.0  # log-evidence of the sides as they are, in every frame
 _MOST_GAIN = 15.0  # that one frame counts; sides are wrong with more
 _HEADINGS = 2  # of a body that begins
@@ -36,7 +34,7 @@ def evidence_of_own_sides(
     Single frames are misleading, one in twenty.
 
     Args:
-        filter: of two cameras or more. frame: the keypoints. found: what was found in it.
+        filter: of cameras that are apart. frame: the keypoints. found: what was found in it.
         lost: of `frames_lost` before this frame; each frame of exchanged sides counts a half.
         before: the same evidence, of the frames up to this one.
     """
@@ -48,10 +46,9 @@ def evidence_of_own_sides(
     if not len(places):
         return after
     as_is = frame.take(places[:, 0])
-    rows, camera, limb = torch.arange(len(places), device=places.device), *places[:, 1:].T
-    other = torch.zeros_like(exchanged[places[:, 0]])
-    other[rows, camera, limb] = True
-    pairs = zip(as_is, with_sides_exchanged(as_is, other, filter.exchange), strict=True)
+    limb = torch.zeros_like(exchanged[places[:, 0]])
+    limb[torch.arange(len(places), device=places.device), places[:, 1], places[:, 2]] = True
+    pairs = zip(as_is, with_sides_exchanged(as_is, limb, filter.exchange), strict=True)
     both = KeypointFrame(*(torch.cat(pair) for pair in pairs))
     own, other = start_with_sides(filter, both, _HEADINGS).log_evidence.chunk(2)
     at = tuple(places.T)
