@@ -27,7 +27,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
     late_note,
     notes_on_still_cameras,
 )
-from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
+from torchpose.whole_body._keypoints.keypoint_start import start
 from torchpose.whole_body._keypoints.upright import level_cameras_up
 
 pytestmark = pytest.mark.usefixtures("undoubted_cameras")
@@ -148,9 +148,20 @@ def test_a_motion_is_taken_by_its_name_or_as_it_is(four, filtered):
 AWAY = (100.0, 1e4, 1e6)  # pixels
 
 
+def tracked_together(seen, cases):
+    """What was there, and the track, of each case of (joints, keypoints), in one batch."""
+    keypoints = torch.stack([pixels for _, pixels in cases.values()])
+    confidence = seen.confidence.expand(len(cases), -1, -1, -1)
+    tracks = tracker(seen.rig)(keypoints=keypoints, confidence=confidence)
+    return {
+        name: (joints, found)
+        for (name, (joints, _)), found in zip(cases.items(), tracks, strict=True)
+    }
+
+
 @pytest.fixture(scope="module")
 def spoiled(four):
-    """What was there, and the track, of the scene with each fault: all are tracked in one batch."""
+    """What was there, and the track, of the scene with each fault."""
     cases = {
         "none": (four.joints, four.keypoints),
         "somebody else": (four.joints, scene(4, T, seed=5).keypoints),
@@ -162,13 +173,7 @@ def spoiled(four):
         "tall": scene(4, T, height=1.95)[::2],
         "aside": (four.joints, _with_a_camera_aside(four)),
     }
-    keypoints = torch.stack([seen for _, seen in cases.values()])
-    confidence = four.confidence.expand(len(cases), -1, -1, -1)
-    tracks = tracker(four.rig)(keypoints=keypoints, confidence=confidence)
-    return {
-        name: (joints, found)
-        for (name, (joints, _)), found in zip(cases.items(), tracks, strict=True)
-    }
+    return tracked_together(four, cases)
 
 
 def _with_wild_wrist(four, away):
@@ -254,19 +259,13 @@ def test_a_person_who_went_away_is_found_elsewhere(spoiled):
 
 @pytest.fixture(scope="module")
 def misled():
-    """What was there, and the track, of two cameras that mislead: both are tracked in one batch."""
+    """What was there, and the track, of two cameras that mislead."""
     two = scene(2, 20)
     cases = {
         "forearm": _with_a_forearm_along_the_view(two),
         "legs": (two.joints, _with_exchanged_legs(two, 0, slice(0, 3))),
     }
-    keypoints = torch.stack([seen for _, seen in cases.values()])
-    confidence = two.confidence.expand(len(cases), -1, -1, -1)
-    tracks = tracker(two.rig)(keypoints=keypoints, confidence=confidence)
-    return {
-        name: (joints, found)
-        for (name, (joints, _)), found in zip(cases.items(), tracks, strict=True)
-    }
+    return tracked_together(two, cases)
 
 
 def _with_a_forearm_along_the_view(two):
@@ -295,7 +294,7 @@ def test_a_body_begins_right_though_one_of_two_cameras_exchanges_its_legs(misled
 
 
 def test_legs_that_began_on_the_wrong_sides_are_turned_back(monkeypatch):
-    monkeypatch.setattr(keypoint_tracker, "start", start_with_sides)
+    monkeypatch.setattr(keypoint_tracker, "likeliest_start", start)
     two = scene(2, 10)
     found = tracker(two.rig)(keypoints=_with_exchanged_legs(two, 0, slice(0, 3)))
     legs = errors(found, two.joints)[:, BOTH_LEGS].mean(-1)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torchpose._core.wording import counted
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
+from torchpose.whole_body._keypoints.keypoint_start import start
 
 _FRAMES = 8  # at most, in which a body begins by each reading
 _AT_A_TIME = 4  # frames: this bounds the memory, and half of all may be enough
@@ -46,6 +46,4 @@ def _telling(frames: KeypointFrame) -> KeypointFrame:
 def _gains(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:
     """Return by how much log-evidence grows if sides are exchanged, of bodies that begin in each frame."""
     other = frames.map(lambda value: value.index_select(2, filter.exchange.mirror))
-    return (
-        start_with_sides(filter, other).log_evidence - start_with_sides(filter, frames).log_evidence
-    )
+    return start(filter, other).log_evidence - start(filter, frames).log_evidence

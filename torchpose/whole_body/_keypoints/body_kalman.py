@@ -506,16 +506,31 @@ class BodyKalmanFilter(nn.Module):
             readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )
         elsewhere = at_large.log_joint.sum(-2)
-        there, accepted = readings.inlier[0] > 0, found.weighed.inlier > 0.5
-        unsure = (there.sum(-2) > 1) & (accepted.sum(-2) < 2)
-        if bool(unsure.any()):
-            agreed = self._log_evidence_where_agreed(
-                state, readings, far, found.weighed.exchanged > 0.5
-            )
-            elsewhere = torch.where(unsure, torch.maximum(elsewhere, agreed), elsewhere)
+        if len(self.maps.shift) > 1:
+            elsewhere = self._or_where_agreed(elsewhere, state, readings, found, far)
         doubt = state.doubt + elsewhere - found.weighed.log_joint.sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
+
+    def _or_where_agreed(
+        self,
+        elsewhere: Float[Tensor, "B J"],
+        state: BodyGaussian,
+        readings: KeypointFrame,
+        found: _Linearised,
+        far: Float[Tensor, "B J 3 3"],
+    ) -> Float[Tensor, "B J"]:
+        """Return the log-evidence of joints elsewhere, at least that of where cameras agree.
+
+        That counts for joints that several cameras see, of which the prediction accepts one at most.
+        """
+        there, accepted = readings.inlier[0] > 0, found.weighed.inlier > 0.5
+        unsure = (there.sum(-2) > 1) & (accepted.sum(-2) < 2)
+        if not bool(unsure.any()):
+            return elsewhere
+        exchanged = found.weighed.exchanged > 0.5
+        agreed = self._log_evidence_where_agreed(state, readings, far, exchanged)
+        return torch.where(unsure, torch.maximum(elsewhere, agreed), elsewhere)
 
     def _log_evidence_where_agreed(
         self,

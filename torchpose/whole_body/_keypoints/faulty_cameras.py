@@ -28,7 +28,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     squared_errors,
     weigh,
 )
-from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
+from torchpose.whole_body._keypoints.keypoint_start import FEW_HEADINGS, start
 from torchpose.whole_body._keypoints.nested import replaced, taken
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, free_turns, looked_again
 from torchpose.whole_body._keypoints.turned_cameras import (
@@ -49,7 +49,6 @@ _PAUSE = 5.0  # seconds until the next search, where none was found
 _WIDE = 2.0  # factor of the noise's variance, above which a camera may be wrong
 _FARTHEST_TURN = 0.5  # radians, of a camera that is used nevertheless
 _RETURN = 0.25  # seconds for which a camera sees the body again before it counts again
-_HEADINGS = 2
 _MOST_PAIRS = 6  # cameras, with which all but two may be wrong
 
 
@@ -170,9 +169,7 @@ def find_faults(
         filter: that tracks on. frame: keypoints as they were detected. faults: that were known so far.
         begun: who has just begun with these, if all have.
     """
-    known = (
-        start_with_sides(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
-    )
+    known = start(filter, corrected(frame, faults, filter.maps)) if begun is None else begun
     least = known.log_evidence - _of_nobody(frame, faults.off, filter.maps) - unlikely(faults.turn)
     tried = _explanations(frame, filter.maps)
     count, n = tried.price.shape
@@ -180,7 +177,7 @@ def find_faults(
     turn, off = tried.turn.flatten(0, 1), tried.off.flatten(0, 1)
     given = frame.take(every.repeat_interleave(n))
     right = _righted(given, turn, off, filter.maps)
-    found = start_with_sides(filter, right, _HEADINGS)
+    found = start(filter, right, FEW_HEADINGS)
     evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
     wrong = any_wrong(off, turn)
     refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)

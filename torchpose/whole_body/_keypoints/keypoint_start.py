@@ -33,8 +33,10 @@ from torchpose.whole_body._keypoints.lifted_pose import corrected_by
 from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.nested import replaced, taken
 
+FEW_HEADINGS = 2
+"""Headings that are enough where bodies are only compared."""
+
 _HEADINGS = 8
-_FEW_HEADINGS = 2  # where shoulders or hips tell which way the body faces
 _WIDTHS = (
     400.0,
     200.0,
@@ -61,57 +63,60 @@ _SIDED = ("shoulder", "hip")
 _LEAST_WIDTH = 0.05  # metres between left and right that tell a direction
 
 
-def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
-    """Return the likeliest starts of B persons whom several cameras see.
+def likeliest_start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
+    """Return the likeliest starts of B persons, of two cameras also of those with exchanged sides.
 
     Of two cameras, one that exchanges left and right of arms or legs looks like a body that has them the
-    wrong way round, so starts with exchanged sides are tried too.
+    wrong way round.
 
     Args:
         filter: that tracks on. frame: the first keypoints.
     """
-    found = start_with_sides(filter, frame)
-    n_cameras = len(filter.maps.shift)
+    found = start(filter, frame)
+    count, n_cameras, _ = frame.inlier.shape
     if n_cameras != 2:
         return found
-    tried = torch.eye(2 * n_cameras, dtype=torch.bool, device=frame.inlier.device)
-    tried = tried.view(-1, n_cameras, 2)
-    for sides in tried:
-        exchanged = sides.expand(len(frame.inlier), -1, -1)
-        other = start_with_sides(filter, frame, _FEW_HEADINGS, exchanged)
-        better = other.log_evidence + _LOG_ODDS > found.log_evidence
-        rows = better.nonzero().squeeze(-1)
-        if len(rows):
-            found = replaced(found, rows, taken(other, rows))
-    return found
+    n = 2 * n_cameras
+    one_limb = torch.eye(n, dtype=torch.bool, device=frame.inlier.device).view(n, n_cameras, 2)
+    every = torch.arange(count, device=frame.inlier.device).repeat_interleave(n)
+    others = start(filter, frame.take(every), FEW_HEADINGS, one_limb.repeat(count, 1, 1))
+    other = taken(others, _likeliest(others, n))
+    better = other.log_evidence + _LOG_ODDS > found.log_evidence
+    rows = better.nonzero().squeeze(-1)
+    return replaced(found, rows, taken(other, rows))
 
 
-def start_with_sides(
+def start(
     filter: BodyKalmanFilter,
     frame: KeypointFrame,
     n_headings: int = _HEADINGS,
     exchanged: Bool[Tensor, "B C 2"] | None = None,
 ) -> CorrectedBody:
-    """Return the likeliest starts with keypoints that are expected to be of some sides.
+    """Return the likeliest starts of B persons whom several cameras see.
 
     Args:
-        filter, frame: as of `start`. n_headings: that are tried.
-        exchanged: sides of arms and legs in each camera; none are if None.
+        filter: that tracks on. frame: the first keypoints. n_headings: that are tried.
+        exchanged: sides of arms and legs that are expected to be, in each camera; none if None.
     """
     sided = frame
     if exchanged is not None:
         sided = with_sides_exchanged(frame, exchanged, filter.exchange)
     joints = triangulate(filter.maps, sided)
     state = _begun(filter, joints, joints.isfinite().all(-1), n_headings)
-    every = torch.arange(len(joints), device=joints.device)
-    rows = every.repeat_interleave(n_headings)
+    rows = torch.arange(len(joints), device=joints.device).repeat_interleave(n_headings)
     if exchanged is not None:
         state = state._replace(log_odds=state.log_odds.where(~exchanged[rows], -_LOG_ODDS))
     frames = frame.take(rows)
     state = _with_trunks(filter, state, filter.without_hips(frames))
     found = filter.correct(state, frames, _WIDTHS)
-    best = every * n_headings + found.log_evidence.view(-1, n_headings).argmax(-1)
+    best = _likeliest(found, n_headings)
     return _by_wider(filter, frame, taken(state, best), taken(found, best))
+
+
+def _likeliest(found: CorrectedBody, n: int) -> Int[Tensor, " B"]:
+    """Return which of each person's n bodies is the likeliest."""
+    best = found.log_evidence.view(-1, n).argmax(-1)
+    return best + n * torch.arange(len(best), device=best.device)
 
 
 def _with_trunks(

@@ -39,7 +39,7 @@ from torchpose.whole_body._keypoints.keypoint_poses import (
     KeypointStep,
     KeypointStream,
 )
-from torchpose.whole_body._keypoints.keypoint_start import start, start_of_one
+from torchpose.whole_body._keypoints.keypoint_start import likeliest_start, start_of_one
 from torchpose.whole_body._keypoints.known_person import of_one_camera
 from torchpose.whole_body._keypoints.lasting_exchange import are_wrong, evidence_of_own_sides
 from torchpose.whole_body._keypoints.lifted_pose import (
@@ -426,7 +426,7 @@ class KeypointTracker(nn.Module):
     def _started(self, frame: KeypointFrame, lifted: Lifted | None) -> CorrectedBody:
         """Return persons who begin with this frame."""
         if self.lifter is None or lifted is None:
-            return start(self.filter, frame)
+            return likeliest_start(self.filter, frame)
         return start_of_one(self.filter, frame, lifted, self.lifter.placed(lifted, frame))
 
     def _begun_anew(

@@ -11,13 +11,12 @@ from torch import Tensor
 
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, with_sides_exchanged
-from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
+from torchpose.whole_body._keypoints.keypoint_start import FEW_HEADINGS, start
 
 # Values of `frames_lost`: in the second frame of exchanged sides, and every third after it.
 _FIRST, _EVERY = 1.0, 1.5
 _LEAST_GAIN = 5.0  # log-evidence of the sides as they are, in every frame
 _MOST_GAIN = 15.0  # that one frame counts; sides are wrong with more
-_HEADINGS = 2  # of a body that begins
 _MOST_CAMERAS = 3  # that see a limb; of more the others tell
 _SEEN = 0.5  # share of the joints of a limb that such a camera sees
 
@@ -50,7 +49,7 @@ def evidence_of_own_sides(
     limb[torch.arange(len(places), device=places.device), places[:, 1], places[:, 2]] = True
     pairs = zip(as_is, with_sides_exchanged(as_is, limb, filter.exchange), strict=True)
     both = KeypointFrame(*(torch.cat(pair) for pair in pairs))
-    own, other = start_with_sides(filter, both, _HEADINGS).log_evidence.chunk(2)
+    own, other = start(filter, both, FEW_HEADINGS).log_evidence.chunk(2)
     at = tuple(places.T)
     gain = (own - other).clamp_max(_MOST_GAIN)
     return after.index_put(at, torch.where(gain > _LEAST_GAIN, before[at] + gain, 0.0))

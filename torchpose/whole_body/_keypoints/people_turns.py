@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.faulty_cameras import LEAST_CAMERAS
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.keypoint_start import start_with_sides
+from torchpose.whole_body._keypoints.keypoint_start import FEW_HEADINGS, start
 from torchpose.whole_body._keypoints.people_association import (
     group_detections,
     owned_detections,
@@ -26,7 +26,6 @@ from torchpose.whole_body._keypoints.turn_looks import likely_turns, side_by_sid
 from torchpose.whole_body._keypoints.turned_cameras import turned, unlikely
 
 _WIDTHS = (25.0, 25.0, 25.0, 9.0, 9.0, 1.0)  # factors of the noise's variance, to group by
-_HEADINGS = 2
 
 
 class CrowdTurns(NamedTuple):
@@ -90,6 +89,6 @@ def _evidence(
     nobodys = ~owned_detections(groups, len(frame.inlier)).mT[..., None] & (frame.inlier > 0)
     evidence = -float((nobodys * filter.maps.log_area[:, None]).sum())
     if len(groups):
-        found = start_with_sides(filter, taken_detections(right, groups), _HEADINGS)
+        found = start(filter, taken_detections(right, groups), FEW_HEADINGS)
         evidence += float(found.log_evidence.sum())
     return evidence
