@@ -317,6 +317,29 @@ def test_the_state_goes_round(name):
         assert_same(run(again), expected)
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "GaussianMixture",
+        "UpperBodyPrior",
+        "PinholeCamera",
+        "BodyTracker",
+        "BodyTracker by keypoints",
+    ],
+)
+def test_a_narrow_state_loads_into_the_precision_of_the_module(name):
+    make, run = CASES[name]
+    copied, assigned = make(2), make(2)
+    narrow = {
+        key: value.float() if getattr(value, "is_floating_point", bool)() else value
+        for key, value in make(1).state_dict().items()
+    }
+    copied.load_state_dict(narrow)
+    assigned.load_state_dict(narrow, assign=True)
+    assert_same(state_of(assigned), state_of(copied))
+    assert_same(run(assigned), run(copied))
+
+
 @pytest.mark.parametrize("name", STATE_ONLY)
 def test_a_measurer_is_copied_and_its_state_loads_into_another(name):
     module = STATE_ONLY[name]()

@@ -187,3 +187,15 @@ def test_a_prior_of_another_kind_is_not_loaded(prior):
     state = bare.state_dict() | {"_extra_state": prior.get_extra_state()}
     with pytest.raises(PriorError, match="windows"):
         bare.load_state_dict(state)
+
+
+def test_a_narrow_state_loads_into_wide_tensors(prior):
+    copied, assigned = (make(copy.deepcopy(prior), "poses") for _ in range(2))
+    narrow = {
+        name: value.float() if getattr(value, "is_floating_point", bool)() else value
+        for name, value in copied.state_dict().items()
+    }
+    copied.load_state_dict(narrow)
+    assigned.load_state_dict(narrow, assign=True)
+    assert_same(run(assigned), run(copied))
+    assert assigned.measurement_cov.dtype == torch.float64

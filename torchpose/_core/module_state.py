@@ -221,10 +221,22 @@ def _is_opaque(tensor: Tensor) -> bool:
     return False
 
 
-class NoHalfModule(nn.Module):
+class _LoadsInOwnPrecision(nn.Module):
+    """Converts a state that is loaded to the precision of its tensors, with `assign=True` too."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        for name, own in self.state_dict(prefix=prefix, keep_vars=True).items():
+            given = state_dict.get(name)
+            if isinstance(own, Tensor) and isinstance(given, Tensor) and own.is_floating_point():
+                state_dict[name] = given.to(own.dtype)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+class NoHalfModule(_LoadsInOwnPrecision):
     """Refuses half precision, in which covariances are indefinite and cameras lose pixels.
 
-    `.half()` or `.to(torch.bfloat16)` of a model that holds it raise an `InputError`.
+    `.half()` or `.to(torch.bfloat16)` of a model that holds it raise an `InputError`. What is loaded
+    takes the precision of the module and of its parts.
     """
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -232,12 +244,23 @@ class NoHalfModule(nn.Module):
         return super()._apply(fn, recurse)
 
 
-class WideModule(nn.Module):
-    """Keeps the precision of its tensors, whatever `.float()` or `.to(dtype)` ask for.
+class OwnPrecisionModule(_LoadsInOwnPrecision):
+    """Keeps the precision of its tensors, whatever `.float()`, `.to(dtype)` or a loaded state ask for."""
 
-    Covariances whose scales span ten orders of magnitude do not survive single precision. What such a
-    call changes is `dtype`, the precision of what goes in and comes out; `.to(device)` moves
-    everything.
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        def moved(tensor: Tensor) -> Tensor:
+            result = fn(tensor)
+            changed = tensor.is_floating_point() and result.dtype != tensor.dtype
+            return tensor.to(result.device) if changed else result
+
+        return super()._apply(moved, recurse)
+
+
+class WideModule(OwnPrecisionModule):
+    """Keeps the precision of its tensors, and has one for what goes in and comes out.
+
+    Covariances whose scales span ten orders of magnitude do not survive single precision. What
+    `.float()` or `.to(dtype)` change is `dtype`; `.to(device)` moves everything.
 
     Attributes:
         dtype: torch.float32 or torch.float64.
@@ -247,7 +270,7 @@ class WideModule(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.dtype = _precision_after(self, fn, self.dtype)
-        return super()._apply(in_own_precision(fn), recurse)
+        return super()._apply(fn, recurse)
 
 
 def _precision_after(
@@ -257,17 +280,6 @@ def _precision_after(
     wanted = fn(torch.zeros(1, dtype=dtype)).dtype
     other_parts = f"convert the other parts of the model by themselves, as model.head.to({wanted})"
     return working_precision(f"precision of {type(module).__name__}", wanted, other_parts)
-
-
-def in_own_precision(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """Return a function for `Module._apply` that moves tensors as `fn` does and leaves their precision."""
-
-    def moved(tensor: Tensor) -> Tensor:
-        result = fn(tensor)
-        changed = tensor.is_floating_point() and result.dtype != tensor.dtype
-        return tensor.to(result.device) if changed else result
-
-    return moved
 
 
 def working_precision(name: str, dtype: torch.dtype, instead: str = "") -> torch.dtype:

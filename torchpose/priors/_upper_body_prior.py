@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_covariance, check_finite
-from torchpose._core.module_state import register_given
+from torchpose._core.module_state import NoHalfModule, register_given
 from torchpose._core.reading import read_npz, reading
 from torchpose._core.tensor_file import require_tensor
 from torchpose.camera._pinhole import PinholeCamera
@@ -33,7 +33,7 @@ _SIDES = ("left", "right")
 _PARTS = ("weights", "means", "covariances")
 
 
-class UpperBodyPrior(nn.Module):
+class UpperBodyPrior(NoHalfModule):
     """Holds Gaussian mixtures over the states of the left and the right arm (BL 7, section 3.1).
 
     Args:

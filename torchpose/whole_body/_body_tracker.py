@@ -1,17 +1,17 @@
 """Track whole bodies: from keypoints or silhouettes in calibrated cameras to the poses of one person."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self, Unpack, overload
+from typing import Any, NamedTuple, Unpack, overload
 
 import torch
 from jaxtyping import Bool, Float, Integer
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_rate, check_tensors
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
-from torchpose._core.module_state import as_one_run, in_own_precision
+from torchpose._core.module_state import OwnPrecisionModule, as_one_run
 from torchpose._core.moved import warn_of_former
 from torchpose._core.uncompiled import uncompiled
 from torchpose.body._kinematics import Body
@@ -59,7 +59,7 @@ class BodyStream(NamedTuple):
     names: tuple[str, ...] | None = None
 
 
-class BodyTracker(nn.Module):
+class BodyTracker(OwnPrecisionModule):
     """Tracks one person's whole body through keypoints or silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
@@ -223,10 +223,6 @@ class BodyTracker(nn.Module):
         """Return the square root of `initial_cov`; deprecated."""
         warn_of_former("BodyTracker.initial_std is the root of initial_cov; it goes")
         return self.initial_cov.sqrt()
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the tensors, as `to` asks for, and keep their precision: that of filters is double."""
-        return super()._apply(in_own_precision(fn), recurse)
 
     @uncompiled
     @takes_former_arguments
