@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from tests.fuzz.samples import body_poses, pose_track
 from torchpose.cli import main
@@ -134,3 +135,12 @@ def test_what_a_file_says_cannot_act_on_a_terminal(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "\\x1b[2J" in out and len(out) < 5000
     assert all(line.isprintable() for line in out.split("\n"))
+
+
+@pytest.mark.parametrize("make", [pose_track, body_poses])
+def test_a_loader_keeps_poses_in_a_list(make):
+    track = make()
+    loader = DataLoader([track, track], batch_size=2, num_workers=1, collate_fn=list)
+    (batch,) = loader
+    assert [type(each) for each in batch] == 2 * [type(track)]
+    assert all(torch.equal(each.joints3d, track.joints3d) for each in batch)
