@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -104,21 +105,24 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
             "table frame,landmark,x,y of each from sync_index, names of point_id, img_loc_x and img_loc_y"
         )
     counted = any(name in header for name in _FRAMES)
-    rows, left_out, times = _without_other_columns(rows if counted else _with_frames(path, rows))
+    if not counted:
+        _check_uncounted_header(path, rows)
+    times = _times(path, rows, needed=not counted)
+    rows, left_out = _without_other_columns(rows if counted else _with_frames(path, rows, times))
     header = rows[0][1]
     long = len(header) > 1 and header[1].lower() in _NAMES
     raw = _long_rows(path, header, rows[1:]) if long else _wide_rows(path, header, rows[1:])
     if any(column.lower().endswith("z") for column in left_out):
         _check_flat(path, raw.keypoints)
     raw.fps, raw.image_size = _csv_notes(path, notes)
-    if raw.fps is None and times:
-        raw.fps, said = _rate_by_times(rows[1:], times[1:])
+    if raw.fps is None and times is not None:
+        raw.fps, said = _rate_by_times(rows[1:], times.stamps)
         if raw.fps is not None:
-            raw.notes, left_out = (said,), [name for name in left_out if name != times[0]]
+            raw.notes, left_out = (said,), [name for name in left_out if name != times.name]
     if left_out:
         shown = first_of(left_out, _SHOWN)
         raw.notes += (f"columns {shown} are passed over: x, y and a score of keypoints count",)
-    if not counted and not times:
+    if not counted and times is None:
         raw.notes += (
             "no column of frames or times: each row is taken for the frame after the last",
         )
@@ -140,62 +144,79 @@ def _from_deeplabcut(path: Path, rows: _Rows) -> _Rows:
     return [(rows[0][0], header), *rows[len(lines.keys() & _DEEPLABCUT) :]]
 
 
-def _with_frames(path: Path, rows: _Rows) -> _Rows:
+class _Times(NamedTuple):
+    """Holds a column of times: its name, its cells with the number of their lines, and their numbers."""
+
+    name: str
+    cells: list[tuple[int, str]]
+    stamps: np.ndarray
+
+
+def _check_uncounted_header(path: Path, rows: _Rows) -> None:
+    """Raise unless a table without a column of frames names keypoints, or points in time, all the same."""
+    number, header = rows[0]
+    long = {"x", "y"} <= {cell.lower() for cell in header} and any(map(is_time, header))
+    if not (long or _ends(header) >= {"_x", "_y"}):
+        raise FileFormatError(
+            f"{path}, line {number}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
+            f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
+        )
+
+
+def _times(path: Path, rows: _Rows, needed: bool) -> _Times | None:
+    """Return the first column of times, None without one; cells that are no times raise where needed."""
+    name = next(filter(is_time, rows[0][1]), None)
+    if name is None:
+        return None
+    column = rows[0][1].index(name)
+    cells = [(number, cells[column]) for number, cells in rows[1:]]
+    stamps = []
+    for number, cell in cells:
+        try:
+            stamps.append(stamp_of(cell))
+        except ValueError as error:
+            if not needed:
+                return None
+            raise FileFormatError(f"{path}, line {number}: {error}") from error
+    return _Times(name, cells, np.array(stamps))
+
+
+def _with_frames(path: Path, rows: _Rows, times: _Times | None) -> _Rows:
     """Return rows with a column of frames in front, by their times, or counted in a table without times.
 
     Times that are several usual steps apart have missing frames between them; equal ones are one frame.
     """
-    header = rows[0][1]
-    time = next((i for i, cell in enumerate(header) if is_time(cell)), None)
-    long = {"x", "y"} <= {cell.lower() for cell in header}
-    if not (_ends(header) >= {"_x", "_y"} or (time is not None and long)):
-        raise FileFormatError(
-            f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
-            f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
-        )
-    frames: Sequence[int] = range(len(rows) - 1)
-    if time is not None:
-        frames = _frames_by_times(path, [(number, cells[time]) for number, cells in rows[1:]])
-    numbered = zip(rows[1:], frames, strict=True)
+    frames = range(len(rows) - 1) if times is None else _frames_by_times(path, times)
+    (number, header), *filled = rows
+    numbered = zip(filled, frames, strict=True)
     return [
-        (rows[0][0], ["frame", *header]),
+        (number, ["frame", *header]),
         *((number, [str(frame), *cells]) for (number, cells), frame in numbered),
     ]
 
 
-def _frames_by_times(path: Path, cells: list[tuple[int, str]]) -> list[int]:
-    """Return the number of each row's frame, given the lines and time stamps of rows."""
-    stamps = np.array([_stamp(path, number, cell) for number, cell in cells])
-    steps = np.diff(stamps)
+def _frames_by_times(path: Path, times: _Times) -> Sequence[int]:
+    """Return the number of each row's frame."""
+    steps = np.diff(times.stamps)
     bad = ~(steps >= 0)  # NaN included
     if bad.any():
-        number, cell = cells[1 + int(np.flatnonzero(bad)[0])]
+        number, cell = times.cells[1 + int(np.flatnonzero(bad)[0])]
         raise FileFormatError(
             f"{path}, line {number}: expected times that increase, as there is no column of frames, "
             f"got {cell or 'none'}"
         )
     usual = usual_step(steps[steps > 0]) if (steps > 0).any() else 1.0
     if (steps > _MAX_GAP * usual).any():
-        number, cell = cells[1 + int(steps.argmax())]
+        number, cell = times.cells[1 + int(steps.argmax())]
         raise FileFormatError(
             f"{path}, line {number}: expected the next time, got {cell}, far later"
         )
     frames = np.where(steps > 0, np.rint(steps / usual).clip(min=1), 0).astype(int)
-    return [0, *frames.cumsum().tolist()][: len(cells)]
+    return [0, *frames.cumsum().tolist()][: len(times.cells)]
 
 
-def _stamp(path: Path, number: int, cell: str) -> float:
-    try:
-        return stamp_of(cell)
-    except ValueError as error:
-        raise FileFormatError(f"{path}, line {number}: {error}") from error
-
-
-def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str], list[str]]:
-    """Return rows with the frame in front and without depths and times, names of these, and one of times.
-
-    The column of times is empty without one; its first cell is its name.
-    """
+def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str]]:
+    """Return rows with the frame in front and without depths and times, and the names of these."""
     header = rows[0][1]
     lower = [cell.lower() for cell in header]
     frame = next(lower.index(name) for name in _FRAMES if name in lower)
@@ -209,21 +230,13 @@ def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str], list[str]]:
 
     left_out = [i for i, cell in enumerate(lower) if is_left_out(cell)]
     kept = [frame, *(i for i in range(len(header)) if i != frame and i not in left_out)]
-    time = next((i for i in left_out if is_time(header[i])), None)
-    times = [] if time is None else [cells[time] for _, cells in rows]
-    return (
-        [(number, [cells[i] for i in kept]) for number, cells in rows],
-        [header[i] for i in left_out],
-        times,
-    )
+    return [(number, [cells[i] for i in kept]) for number, cells in rows], [
+        header[i] for i in left_out
+    ]
 
 
-def _rate_by_times(rows: _Rows, times: list[str]) -> tuple[float | None, str]:
+def _rate_by_times(rows: _Rows, stamps: np.ndarray) -> tuple[float | None, str]:
     """Return the frames per second by the time stamps of rows of checked frames, and a note on them."""
-    try:
-        stamps = np.array([stamp_of(cell) for cell in times])
-    except ValueError:
-        return None, ""
     frames, first = np.unique([float(cells[0]) for _, cells in rows], return_index=True)
     return frame_rate(np.diff(stamps[first]) / np.diff(frames))
 
