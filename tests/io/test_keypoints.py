@@ -18,6 +18,7 @@ from torchpose.errors import (
     SkeletonError,
 )
 from torchpose.io import Keypoints, read_keypoints, write_keypoints
+from torchpose.io._formats.keypoint_files import is_keypoint_header
 from torchpose.io._formats.openpose import _BODY_25B, read_openpose_people
 from torchpose.skeleton import SKELETONS
 from torchpose.skeleton._joint_sets import COCO
@@ -240,6 +241,22 @@ def test_wide_rows(tmp_path):
     assert read.keypoints[3, 1].tolist() == [5, 6]
 
 
+@pytest.mark.parametrize(
+    "spelling",
+    ["HEAD_X,HEAD_Y,HEAD_SCORE", "HeadX,HeadY,HeadScore", "Head.x,Head.y,Head.score",
+     "Head X,Head Y,Head Score", "x_Head,y_Head,score_Head", "X-head,Y-head,Score-head"],
+)  # fmt: skip
+def test_columns_of_other_spellings(tmp_path, spelling):
+    plain = read_keypoints(text(tmp_path, "frame,head_x,head_y,head_score", "0,10,20,0.5"))
+    read = read_keypoints(text(tmp_path, f"frame,{spelling}", "0,10,20,0.5"))
+    assert [name.lower() for name in read.names] == ["head"]
+    assert (read.keypoints.tolist(), read.confidence.tolist()) == ([[[10, 20]]], [[0.5]])
+    assert read.notes == plain.notes == ()
+    x, y, _ = spelling.split(",")
+    assert is_keypoint_header(["time", x, y])
+    assert not is_keypoint_header(["time", x, y, y.replace("Y", "Z").replace("y", "z")])
+
+
 def test_long_rows(tmp_path):
     path = text(
         tmp_path,
@@ -303,7 +320,10 @@ def test_visibility_of_arrays_is_the_confidence_where_there_is_none(tmp_path):
             "rename e, a, b and 1 more .*# fps",
         ),
         (["frame,head_x,head_y,head_x", "0,1,2,3"], "each once"),
-        (["frame,x1,y1,z1,v1,x2,y2,z2,v2", "0,1,2,3,4,5,6,7,8"], "got frame, x1, y1 and 6 more$"),
+        (
+            ["frame,x1,y1,z1,v1,x2,y2,z2,v2", "0,1,2,3,4,5,6,7,8"],
+            "got frame, x1, y1 and 6 more; rename them so$",
+        ),
         (["frame,head_x,head_y", "0,1"], "line 2.*3 cells"),
         (["frame,head_x,head_y", "0,1,two"], "line 2.*'two'"),
         (["frame,head_x,head_y", "0,1,2", "0,1,2"], "line 3.*increase"),
@@ -312,7 +332,12 @@ def test_visibility_of_arrays_is_the_confidence_where_there_is_none(tmp_path):
         (["frame,head_x,head_y", "0,1,2", "999999999,1,2"], "line 3.*999999999"),
         (["frame,name,x,y", "0,head,1,2", "0,head,1,2"], "twice"),
         (["frame,name,x,y", "1,head,1,2", "0,head,1,2"], "line 3.*increase"),
-        (["frame,name,x,y,colour", "0,head,1,2,3"], "got frame,name,x,y,colour"),
+        (["frame,name,x,y,colour", "0,head,1,2,3"], "got frame,name,x,y,colour; rename or delete"),
+        (["frame,name,PoseX,PoseY", "0,head,1,2"], "got frame,name,PoseX,PoseY; rename or delete"),
+        (["frame,xHead,yHead", "0,1,2"], "got frame, xHead, yHead; rename them so"),
+        (["frame,HeadX,HeadY,MaxX", "0,1,2,3"], "delete or rename MaxX"),
+        (["frame,HeadX,HeadY,y_Head", "0,1,2,3"], "delete or rename y_Head"),
+        (["frame,HeadX,HeadY,Head.x,Head.y", "0,1,2,3,4"], "delete or rename HeadX, HeadY"),
         (["# fps = fast", "frame,head_x,head_y", "0,1,2"], "fps"),
         (["# fps = 0", "frame,head_x,head_y", "0,1,2"], "fps"),
     ],

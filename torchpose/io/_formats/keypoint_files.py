@@ -1,6 +1,7 @@
 """Read 2D keypoints from .npz and .csv files as they are there, before any check of their values."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,12 @@ _SCORES = (*_TRUST, "score", "likelihood")  # names of it in tables
 _FRAMES = ("frame", "frame_number", "frame_index", "frame_idx", "frame_id", "sync_index")
 _NAMES = ("name", "keypoint", "landmark", "joint", "bodypart")
 _PASSED_OVER = ("z", "presence")  # beside x and y; MediaPipe's depth is no measurement
+_KINDS = ("x", "y", *_PASSED_OVER, *_SCORES)
+_SPELLINGS = (  # of columns, in place of NAME_x
+    re.compile(rf"(?P<name>.+?)[_.:\s-]+(?P<kind>{'|'.join(_KINDS)})", re.IGNORECASE),  # Head.X
+    re.compile(rf"(?P<kind>{'|'.join(_KINDS)})[_.:\s-]+(?P<name>.+)", re.IGNORECASE),  # x_Head
+    re.compile(rf"(?P<name>.*[a-z0-9])(?P<kind>{'|'.join(map(str.title, _KINDS))})"),  # HeadX
+)
 _DEEPLABCUT = {"scorer", "individuals", "bodyparts", "coords"}  # first cells of its header
 _OF_SEVERAL_CAMERAS = {"point_id", "img_loc_x", "img_loc_y"}
 _NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
@@ -52,7 +59,27 @@ def is_keypoint_header(cells: Sequence[str]) -> bool:
 
 def _ends(cells: Sequence[str]) -> set[str]:
     """Return the last two characters of the names of columns: "_x" of NAME_x."""
-    return {cell[-2:].lower() for cell in cells}
+    return {cell[-2:] for cell in _usual_header(cells)}
+
+
+def _usual_header(cells: Sequence[str]) -> list[str]:
+    """Return names of columns as NAME_x, of those that are spelt in another way and have an x and a y.
+
+    >>> _usual_header(["frame", "HeadX", "HeadY", "HeadScore", "MaxX"])
+    ['frame', 'Head_x', 'Head_y', 'Head_score', 'MaxX']
+    """
+    wide = not {cell.lower() for cell in cells} & {*_NAMES}
+    for spelling in _SPELLINGS if wide else ():
+        found = {cell: match for cell in cells if (match := spelling.fullmatch(cell))}
+        parts = {cell: (match["name"], match["kind"].lower()) for cell, match in found.items()}
+        points = {
+            name for name, _ in parts.values() if {(name, "x"), (name, "y")} <= {*parts.values()}
+        }
+        if points:
+            return [
+                "_".join(parts[c]) if c in parts and parts[c][0] in points else c for c in cells
+            ]
+    return list(cells)
 
 
 @dataclass
@@ -98,6 +125,7 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
         raise FileFormatError(f"{path}: expected a header frame,NAME_x,NAME_y,...; it is empty")
     rows = split_rows(path, filled, len(split_row(filled[0][1])))
     rows = _from_deeplabcut(path, rows)
+    rows[0] = rows[0][0], _usual_header(rows[0][1])
     header = [cell.lower() for cell in rows[0][1]]
     if set(header) >= _OF_SEVERAL_CAMERAS:
         raise FileFormatError(
@@ -268,7 +296,8 @@ def _wide_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
     if not names or absent or len(column) != len(header):
         raise FileFormatError(
             f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],... each once, got "
-            f"{first_of(absent or header, _SHOWN)}" + " (absent)" * bool(absent)
+            f"{first_of(absent or header, _SHOWN)}"
+            + (" (absent)" if absent else "; rename them so")
         )
     table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
     table = table.reshape(-1, len(header))
@@ -289,7 +318,8 @@ def _long_rows(path: Path, header: list[str], rows: _Rows) -> RawKeypoints:
     scored = len(header) == 5 and header[4].lower() in _SCORES
     if len(header) != 4 + scored or [cell.lower() for cell in header[2:4]] != ["x", "y"]:
         raise FileFormatError(
-            f"{path}: expected columns frame,name,x,y[,confidence], got {','.join(header)}"
+            f"{path}: expected columns frame,name,x,y[,confidence], got {','.join(header)}; rename or "
+            "delete columns"
         )
     names = list(dict.fromkeys(cells[1] for _, cells in rows))
     table = np.array([[_cell(path, number, c) for c in (cells[0], *cells[2:])]
