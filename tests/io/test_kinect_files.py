@@ -1,5 +1,7 @@
 """Kinect v1, v2 and Azure files, one and several bodies: what a hand-made file says comes back."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -226,6 +228,7 @@ def test_rows_of_single_joints_are_refused(tmp_path):
     [
         ("1 2 3 4 5\n", "rows of 60, 61"),
         ("frame,head_x,head_y\n0,1,2\n", "a header with NAME_x.*got frame, head_x, head_y"),
+        ("frame,name,x,y,z\n0,head,1,2,3\n", "a row for each frame, got frame, name, x"),
         (rows_text(person(V1, 2)).rsplit(" ", 3)[0], "line 2: expected 60 numbers.*got 57"),
         (rows_text(person(V1, 2)).replace("0", "o", 1), "line 1: expected numbers"),
     ],
@@ -473,6 +476,15 @@ def test_quoted_cells_and_units_beside_names(tmp_path):
     text = "\n".join(f'"{line}"' for line in text.splitlines())
     [found] = read_recording(write(tmp_path, "a.csv", text))
     np.testing.assert_allclose(to_kinect(found.joints.numpy()), joints, atol=1e-6)
+
+
+def test_axes_before_names(tmp_path):
+    text = header_text(to_kinect(person(V2, 3)), V2)
+    [plain] = read_recording(write(tmp_path, "a.csv", text))
+    head, rest = text.split("\n", 1)
+    turned = re.sub(r"(\w+)_([xyz]|state)\b", r"\2_\1", head)
+    [found] = read_recording(write(tmp_path, "a.csv", f"{turned}\n{rest}"))
+    assert turned != head and found.joints.equal(plain.joints)
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])

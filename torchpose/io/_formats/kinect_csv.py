@@ -33,10 +33,11 @@ from torchpose.skeleton._joint_sets import SKELETONS, canonical_name
 
 _GAP = 1.5  # median steps
 _SHOWN = 3  # cells that a message lists
-_COLUMN = re.compile(
-    r"(?P<joint>.*?[a-z0-9])[ _.:/-]*(?P<what>x|y|z|state|tracking_?state|confidence)"
-    r"( *[\[(](m|cm|mm)[\])])?",  # the size of the body tells the unit
-    re.IGNORECASE,
+_WHAT = r"(?P<what>x|y|z|state|tracking_?state|confidence)"
+_UNIT = r"( *[\[(](m|cm|mm)[\])])?"  # the size of the body tells the unit
+_COLUMNS = (
+    re.compile(rf"(?P<joint>.*?[a-z0-9])[ _.:/-]*{_WHAT}{_UNIT}", re.IGNORECASE),
+    re.compile(rf"{_WHAT}[ _.:/-]+(?P<joint>.*?){_UNIT}", re.IGNORECASE),
 )
 _STATES = {
     "nottracked": 0.0, "inferred": 1.0, "tracked": 2.0,  # Kinect v2
@@ -86,7 +87,7 @@ def read_kinect_csv(path: Path) -> list[RawRecording]:
     if rows and not is_row(rows[0][1]):
         raise FileFormatError(
             f"{path}, line {rows[0][0]}: expected numbers, or a header with NAME_x, NAME_y and NAME_z of "
-            f"each joint (SpineBase_x, left_hand_x) above them, got "
+            "each joint (SpineBase_x, left_hand_x) above them, and a row for each frame, got "
             f"{first_of(split_row(rows[0][1]), _SHOWN):.120}"
         )
     return [_read_rows(path, rows, facts)]
@@ -96,11 +97,11 @@ def header_joints(line: str) -> dict[str, dict[str, int]]:
     """Return the columns by joint and by what they hold; empty unless a joint has x, y and z."""
     found: dict[str, dict[str, int]] = {}
     for column, cell in enumerate(split_row(line)):
-        match = _COLUMN.fullmatch(cell.strip().strip('"'))
-        if match is None or not _is_joint(match["joint"]):
-            continue
-        what = match["what"].lower().replace("tracking_", "").replace("tracking", "")
-        found.setdefault(match["joint"], {})[what] = column
+        name = cell.strip().strip('"')
+        for match in filter(None, (spelling.fullmatch(name) for spelling in _COLUMNS)):
+            if _is_joint(match["joint"]):
+                what = match["what"].lower().replace("tracking_", "").replace("tracking", "")
+                found.setdefault(match["joint"], {})[what] = column
     return found if any({"x", "y", "z"} <= set(joint) for joint in found.values()) else {}
 
 
