@@ -24,6 +24,8 @@ _INDEXED = {"aten::index.Tensor", "aten::index_put_", "aten::index_put", "aten::
 class _Elsewhere(torch.Tensor):
     """A tensor of the CPU under the name of another device."""
 
+    is_meta = False  # it holds numbers
+
     @staticmethod
     def __new__(cls, inner):
         return torch.Tensor._make_wrapper_subclass(

@@ -160,6 +160,27 @@ def test_unseen_matrices_are_mended_alike():
     assert largest_difference(each, seen) == 0.0
 
 
+@pytest.mark.parametrize("name", ["fixed", "mixture"])
+def test_values_that_cannot_be_looked_at_are_refused(name):
+    model, z = make(name), frames()[0]
+    with pytest.raises(InputError, match=r"torch\.func\.vmap.*without_value_checks"):
+        torch.func.vmap(lambda z: model(z).mean, randomness="same")(z[:, :, None])
+    with pytest.raises(InputError, match="z must hold numbers"):
+        model(z.transpose(0, 1).to("meta"))
+    with pytest.raises(InputError, match='nothing runs on the device "meta"'):
+        model.to("meta")(z.transpose(0, 1))
+
+
+def test_a_tracker_inside_vmap_asks_for_the_whole_batch():
+    prior = torchpose.load_prior("kinect-upper-body-small")
+    tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
+    keypoints = torch.full((2, 1, 3, 2, 2), 240.0)
+    with pytest.raises(InputError, match="trackers take the whole batch"):
+        torch.func.vmap(lambda k: tracker(k, names=["head", "neck"]).joints3d)(keypoints)
+    with pytest.raises(InputError, match="device meta"):
+        torchpose.UpperBodyTracker(prior.to("meta"), camera=prior.camera)
+
+
 def test_a_tracker_that_chooses_by_what_it_measured_says_that_it_cannot_be_exported():
     prior = torchpose.load_prior("kinect-upper-body")
     tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)

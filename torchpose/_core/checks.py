@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.uncompiled import is_exporting
-from torchpose._core.value_checks import values_visible
+from torchpose._core.value_checks import look_at, values_visible
 from torchpose.errors import (
     CovarianceError,
     InputError,
@@ -69,7 +69,7 @@ def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: s
     bad = ~torch.isfinite(tensor)
     if where is not None:
         bad = bad & where
-    if bool(bad.any()):
+    if look_at(bad.any()):
         index = tuple(int(i) for i in torch.nonzero(bad)[0])
         value = float(tensor.detach()[index])
         count = int(bad.sum())
@@ -289,7 +289,7 @@ def _are_covariances(matrices: Tensor, tolerance: float) -> bool:
     skew = (matrices - matrices.mT).abs().amax((-2, -1))
     close = (skew < tolerance * matrices.abs().amax((-2, -1))).all()
     info = torch.linalg.cholesky_ex((matrices + matrices.mT) / 2).info
-    return bool(close & ~info.any())
+    return bool(look_at(close & ~info.any()))
 
 
 def refuse_unused(

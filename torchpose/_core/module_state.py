@@ -3,7 +3,7 @@
 import functools
 import threading
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, NamedTuple, Self, TypeVar, cast, overload
 from weakref import WeakKeyDictionary
 
@@ -111,7 +111,7 @@ def one_run(device: torch.device) -> Iterator[None]:
     kept while the run lasts and not beyond: its graph is freed by the backward pass, and the next run
     has to build its own.
     """
-    with torch.autocast(device.type, enabled=False):
+    with _full_precision(device):
         if torch.compiler.is_dynamo_compiling():
             yield
             return
@@ -123,6 +123,15 @@ def one_run(device: torch.device) -> Iterator[None]:
             if _GRAPHS.depth == 0:
                 _GRAPHS.kept.clear()
                 _GRAPHS.traced.clear()
+
+
+def _full_precision(device: torch.device) -> AbstractContextManager[Any]:
+    try:
+        return torch.autocast(device.type, enabled=False)
+    except RuntimeError as error:
+        raise InputError(
+            f'nothing runs on the device "{device}"; move the module to another one, such as "cpu"'
+        ) from error
 
 
 def as_one_run(method: F) -> F:

@@ -8,9 +8,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from torchpose.errors import InputError
 
 _HIDDEN: ContextVar[bool] = ContextVar("torchpose_values_hidden", default=False)
 
@@ -49,9 +52,34 @@ def values_visible() -> bool:
     return not (torch.compiler.is_compiling() or _HIDDEN.get())
 
 
+def look_at(value: Tensor) -> Any:
+    """Return the number or truth value that a tensor of one element holds.
+
+    Raises:
+        InputError: it has none to look at, inside `torch.func.vmap` or on the device "meta".
+    """
+    try:
+        return value.item()
+    except RuntimeError as error:
+        if _has_memory(value):
+            raise
+        raise InputError(
+            "expected values that can be looked at, got tensors inside torch.func.vmap, where filters need "
+            "torchpose.without_value_checks() and trackers take the whole batch, or on the device meta, "
+            "which holds none"
+        ) from error
+
+
+def _has_memory(tensor: Tensor) -> bool:
+    try:
+        return tensor.data_ptr() != 0
+    except RuntimeError:  # of a transform
+        return False
+
+
 def seen_finite(values: Tensor) -> bool:
     """Return whether values may be looked at and all are finite; False too where their sum overflows.
 
     Their sum takes a fraction of the time of a look at each of them.
     """
-    return values_visible() and math.isfinite(float(values.detach().sum()))
+    return values_visible() and math.isfinite(look_at(values.detach().sum()))

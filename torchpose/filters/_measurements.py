@@ -12,6 +12,7 @@ from torchpose._core.checks import (
     check_floating,
     check_real,
     check_shape,
+    check_tensors,
     check_variances,
     refuse_half,
 )
@@ -65,6 +66,7 @@ def check_values(
         ShapeError, InputError: what does not fit.
     """
     check_floating("z", z)
+    check_tensors(z=z)
     refuse_half("z", z)
     check_shape("z", z, ["B", "T", n_observed])
     batch, n_frames = z.shape[:2]
