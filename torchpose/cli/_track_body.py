@@ -32,7 +32,7 @@ from torchpose.cli._track_body_output import (
     write_page,
     write_people,
 )
-from torchpose.cli._uncalibrated import camera_without_file, needs_no_file, told_tilt
+from torchpose.cli._uncalibrated import camera_without_file, is_tilt_told, needs_no_file, told_tilt
 from torchpose.errors import CameraError, InputError, NobodySeenError
 
 if TYPE_CHECKING:
@@ -192,8 +192,8 @@ def run(
     found, notes = _cameras(cameras, camera_names, inputs, videos, tilt, roll)
     finds_tilt = False
     if needs_no_file(cameras):
-        finds_tilt = not by_particles(method) and tilt is None and roll is None and up is None
-        notes += (told_tilt(tilt, roll, up),) * (not finds_tilt)
+        finds_tilt = not (by_particles(method) or is_tilt_told(given.values) or up)
+        notes += () if finds_tilt else (told_tilt(given.values),)
     if camera_names is None:
         check_numbers(inputs, [camera.name for camera in found])
     job = BodyJob(
@@ -253,8 +253,8 @@ def _run_on_keypoints(
     arguments = tracker
     if not by_particles(values["method"]):
         names = ("body", "height", "keypoint_std", "pixel_std", "motion", "camera_height")
-        told = values["tilt"] is not None or values["roll"] is not None
-        arguments = {**{name: tracker[name] for name in names}, "up": "y" if told else values["up"]}
+        up = "y" if is_tilt_told(values) else values["up"]
+        arguments = {**{name: tracker[name] for name in names}, "up": up}
     outlines = None
     if values["silhouettes"]:
         outlines = SilhouetteSettings(values["rows"], values["background"], values["ignore_still"])

@@ -12,7 +12,7 @@ from torchpose.cli._command import Given
 from torchpose.cli._options import Option, options_of, options_of_methods
 from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import KALMAN
-from torchpose.cli._uncalibrated import needs_no_file
+from torchpose.cli._uncalibrated import is_tilt_told, needs_no_file
 from torchpose.errors import InputError
 
 PYTHON_ONLY = frozenset({
@@ -159,8 +159,7 @@ def _check_without_file(given: Given, by_keypoints: bool) -> None:
             "--detector finds keypoints in videos"
         )
     given.refuse(("camera_names",), f"camera files, and {cameras} stands for one camera")
-    told = given.values["tilt"] is not None or given.values["roll"] is not None
-    if told and given.values["up"] is not None:
+    if is_tilt_told(given.values) and given.values["up"] is not None:
         raise InputError("--tilt and --roll tell which way is up; leave --up out, or them")
 
 

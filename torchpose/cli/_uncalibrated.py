@@ -4,9 +4,9 @@ Its world has y up. Which way that is is stated, or found by how people stand.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchpose.cli._track import is_video
 from torchpose.errors import CameraError, InputError
@@ -66,12 +66,17 @@ def camera_without_file(
     return held_camera(camera, tilt, roll, None, given).in_level_world(), notes
 
 
-def told_tilt(tilt: float | None, roll: float | None, up: str | None) -> str:
-    """Return the note on the world of a camera whose tilt is not looked for."""
-    if tilt is None and roll is None:
-        level = "it is level, as --up says" if up else "it is taken to be about level"
-        return f"the camera has no pose: {_AXES}; {level}"
-    return f"the camera {_angles(tilt or 0.0, roll or 0.0)}: {_AXES}"
+def is_tilt_told(values: Mapping[str, Any]) -> bool:
+    """Return whether options tell how the camera is held."""
+    return values["tilt"] is not None or values["roll"] is not None
+
+
+def told_tilt(values: Mapping[str, Any]) -> str:
+    """Return the note on the world of a camera whose tilt is not looked for, given the options."""
+    if is_tilt_told(values):
+        return f"the camera {_angles(values['tilt'] or 0.0, values['roll'] or 0.0)}: {_AXES}"
+    level = "it is level, as --up says" if values["up"] else "it is taken to be about level"
+    return f"the camera has no pose: {_AXES}; {level}"
 
 
 def tilt_of(
