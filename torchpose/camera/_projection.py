@@ -71,16 +71,12 @@ def backproject(
     """
     check_shape("uvl", uvl, ["...", None, 3])
     check_shape("K", K, ["...", 3, 3])
-    pixels, depth = uvl.split([2, 1], -1)
-    if uvl.dtype == K.dtype and uvl.dtype in (torch.float32, torch.float64):
-        eye = torch.eye(3, dtype=K.dtype, device=K.device)
-        inverse = torch.linalg.solve_triangular(K, eye, upper=True)
-        return (homogeneous_pixels(pixels) @ inverse.mT) * depth
-    # K is triangular, so its inverse needs no solver: there is none for half precision
-    fx, skew, _, fy = K[..., None, :2, :2].flatten(-2).unbind(-1)
-    u, v = (pixels - K[..., None, :2, 2]).unbind(-1)
-    y = v / fy
-    return torch.stack([(u - skew * y) / fx, y, torch.ones_like(y)], -1) * depth
+    dtype = torch.promote_types(uvl.dtype, K.dtype)
+    wide = torch.promote_types(dtype, torch.float32)  # there is no solver for half precision
+    pixels, depth = uvl.to(wide).split([2, 1], -1)
+    eye = torch.eye(3, dtype=wide, device=K.device)
+    inverse = torch.linalg.solve_triangular(K.to(wide), eye, upper=True)
+    return ((homogeneous_pixels(pixels) @ inverse.mT) * depth).to(dtype)
 
 
 def turn_homography(
