@@ -49,7 +49,7 @@ from torchpose.evaluation._unseen import (
 )
 from torchpose.io._recordings import Recording
 from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
-from torchpose.priors._arms import persons_of_shipped_arm_prior
+from torchpose.priors._arms import shipped_arm_prior
 from torchpose.priors._upper_body_prior import UpperBodyPrior, load_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator_table import METHODS, choose_method, method_options
@@ -155,7 +155,7 @@ def _known_to_arms(persons: Set[str], method: str) -> list[str]:
     """Return the persons on whom the prior over arms was fitted, if the method uses it."""
     if "arms" not in method_options(method):
         return []
-    return sorted(persons & set(persons_of_shipped_arm_prior()))
+    return sorted(persons & set(shipped_arm_prior().info.persons))
 
 
 def _check_arms(known: Sequence[str]) -> None:

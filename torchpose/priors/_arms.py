@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_shape
-from torchpose._core.module_state import register_given
+from torchpose._core.module_state import outside_inference, register_given
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, require_tensor, write_tensors
 from torchpose.errors import InputError, PriorError
@@ -154,15 +155,11 @@ class ArmPrior(nn.Module):
             )  # fmt: skip
 
 
+@cache
 def shipped_arm_prior() -> ArmPrior:
-    """Return the prior over arms that comes with the package."""
-    return ArmPrior.load(_SHIPPED)
-
-
-def persons_of_shipped_arm_prior() -> tuple[str, ...]:
-    """Return the persons that the shipped prior over arms was fitted to, without making the prior."""
-    info: ArmPriorInfo = read_tensors(_SHIPPED, _KIND)[0]
-    return info.persons
+    """Return the prior over arms that comes with the package, the same one each time: change a copy."""
+    with outside_inference():
+        return ArmPrior.load(_SHIPPED)
 
 
 def _checked(

@@ -534,10 +534,7 @@ def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:
-    """Return the prior of a file, or that of the package; read once for each tracker."""
-    return derived(
-        owner,
-        ("arm prior", str(path)),
-        (like,),
-        lambda: ArmPrior.load(path) if path else shipped_arm_prior(),
-    )
+    """Return the prior of a file, read once for each tracker, or that of the package."""
+    if not path:
+        return shipped_arm_prior()
+    return derived(owner, ("arm prior", str(path)), (like,), lambda: ArmPrior.load(path))

@@ -33,7 +33,7 @@ from torchpose.measure._upper_body_measurer import (
     MeasurerState,
     UpperBodyMeasurer,
 )
-from torchpose.priors._arms import persons_of_shipped_arm_prior
+from torchpose.priors._arms import shipped_arm_prior
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator_table import BONES, method_options
@@ -443,7 +443,7 @@ def _method_of(prior: UpperBodyPrior, options: TrackerOptions) -> str | None:
     of_others = {"window", "steady", *MethodOptions.__annotations__} - set(method_options(BONES))
     given = {name for name, value in options.items() if value is not None}
     persons = set(prior.info.persons)
-    known = bool(persons) and persons <= set(persons_of_shipped_arm_prior())
+    known = bool(persons) and persons <= set(shipped_arm_prior().info.persons)
     return BONES if known and of_others.isdisjoint(given) else None
 
 
