@@ -171,6 +171,26 @@ def test_values_that_cannot_be_looked_at_are_refused(name):
         model.to("meta")(z.transpose(0, 1))
 
 
+def test_densities_are_exported_saved_and_vectorised(tmp_path):
+    class Density(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.mixture = torchpose.load_prior("kinect-upper-body-small").left
+
+        def forward(self, x):
+            return self.mixture.log_prob(x)
+
+    density = Density()
+    x = density.mixture.means[:5] + 0.01
+    count = {0: torch.export.Dim("count", min=2, max=400)}
+    torch.export.save(
+        torch.export.export(density, (x,), dynamic_shapes=(count,)), tmp_path / "p.pt2"
+    )
+    loaded = torch.export.load(tmp_path / "p.pt2").module()
+    assert largest_difference(loaded(x[:3]), density(x[:3])) <= 1e-12
+    assert largest_difference(torch.func.vmap(density)(x), density(x)) <= 1e-12
+
+
 def test_a_tracker_inside_vmap_asks_for_the_whole_batch():
     prior = torchpose.load_prior("kinect-upper-body-small")
     tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
