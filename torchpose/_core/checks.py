@@ -24,6 +24,7 @@ STAYS_POSITIVE = "what is learnt stays positive as the exponential of a paramete
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second
 _LARGEST_SHARE = 2.0  # of the image; joints may lie outside of it
+_MOST_SKEW = 1e-6  # of a covariance, relative to its largest entry
 _SEVERAL = 3  # keypoints that tell whether most are shares
 
 
@@ -245,13 +246,12 @@ def check_variances(name: str, variances: Tensor) -> None:
         )
 
 
-def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> None:
+def check_covariance(name: str, covariance: Tensor) -> None:
     """Raise `CovarianceError` unless every matrix is symmetric and positive definite.
 
     Args:
         name: the name of the covariance, for the message.
         covariance: [..., D, D].
-        tolerance: largest asymmetry, relative to the largest entry of each matrix.
 
     Raises:
         ShapeError: not square. InputError: not finite. CovarianceError: not symmetric or not
@@ -259,13 +259,13 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
     """
     if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
         raise ShapeError(f"{name} must have shape [..., D, D], got {list(covariance.shape)}")
-    if not values_visible() or _are_covariances(covariance, tolerance):
+    if not values_visible() or _are_covariances(covariance):
         return
     check_finite(name, covariance)
     scale = covariance.abs().amax((-2, -1)).clamp_min(torch.finfo(covariance.dtype).tiny)
     skew = (covariance - covariance.mT).abs().amax((-2, -1)) / scale
-    if bool((skew > tolerance).any()):
-        index = tuple(int(i) for i in torch.nonzero(skew > tolerance)[0])
+    if bool((skew > _MOST_SKEW).any()):
+        index = tuple(int(i) for i in torch.nonzero(skew > _MOST_SKEW)[0])
         raise CovarianceError(
             f"{name} must be symmetric, got a matrix with relative asymmetry {float(skew.max()):.2g}"
             f"{_at(index)}; pass (C + C.mT) / 2 if that is what you mean"
@@ -284,10 +284,10 @@ def _at(index: tuple[int, ...]) -> str:
     return f" at index {index}" if index else ""
 
 
-def _are_covariances(matrices: Tensor, tolerance: float) -> bool:
+def _are_covariances(matrices: Tensor) -> bool:
     """Return whether all matrices are covariances beyond doubt; NaN and infinite numbers are not."""
     skew = (matrices - matrices.mT).abs().amax((-2, -1))
-    close = (skew < tolerance * matrices.abs().amax((-2, -1))).all()
+    close = (skew < _MOST_SKEW * matrices.abs().amax((-2, -1))).all()
     info = torch.linalg.cholesky_ex((matrices + matrices.mT) / 2).info
     return bool(look_at(close & ~info.any()))
 

@@ -109,13 +109,13 @@ class MixtureFit(nn.Module):
         return cls(first, shift, factor, (inverse * variances) @ inverse.T, dtype)
 
     @classmethod
-    def blank(cls, n_components: int, dim: int, dtype: torch.dtype = torch.float64) -> Self:
+    def blank(cls, n_components: int, dim: int) -> Self:
         """Return a mixture of the given size to load a `state_dict` into."""
         eye = torch.eye(dim, dtype=torch.float64)
         means = torch.zeros(n_components, dim, dtype=torch.float64)
         weights = torch.full((n_components,), 1 / n_components, dtype=torch.float64)
         start = MixtureParameters(weights, means, eye.expand(n_components, -1, -1))
-        return cls(start, means[0], eye, torch.zeros_like(eye), dtype)
+        return cls(start, means[0], eye, torch.zeros_like(eye), torch.float64)
 
     def restart(self, parameters: MixtureParameters) -> None:
         """Go on from another mixture, given in the units of the buffers, with an empty history."""

@@ -25,6 +25,7 @@ between the shoulders, and from Kinect's neck up to the head."""
 
 _SPHERES = 2 * math.log(4 * math.pi)  # log of the area of S^2 x S^2
 _SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "arms" / "upper-body-arms.safetensors"
+_POINTS = 20_000  # on both spheres, by which a density is integrated
 _PARTS = ("weights", "means", "covariances")
 
 
@@ -183,11 +184,11 @@ def _checked(
     return together
 
 
-def _log_mass(mixture: GaussianMixture, n_points: int = 20_000) -> Tensor:
+def _log_mass(mixture: GaussianMixture) -> Tensor:
     """Return the log of the mixture's integral over S^2 x S^2, by points spread over both spheres."""
     generator = torch.Generator().manual_seed(0)
-    points = torch.randn(n_points, 2, 3, generator=generator, dtype=torch.float64)
+    points = torch.randn(_POINTS, 2, 3, generator=generator, dtype=torch.float64)
     points = torch.nn.functional.normalize(points, dim=-1).flatten(1)
     with torch.no_grad():
         density = mixture.log_prob(points.to(mixture.means.device))
-    return torch.logsumexp(density, 0) - math.log(n_points) + _SPHERES
+    return torch.logsumexp(density, 0) - math.log(_POINTS) + _SPHERES

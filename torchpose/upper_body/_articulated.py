@@ -204,16 +204,13 @@ class ArticulatedFilter(Estimator):
                 f"arms must be a prior over arms or the path of its file, got {type(arms).__name__}"
             )
         self.model = model
-        owner = model.owner
-        like = model.measurement_cov
-        self.prior = arms if isinstance(arms, ArmPrior) else _kept(owner, arms, like)
-        prior = self.prior
-        sources = (*prior.directions.parameters_tuple(), prior.log_mass, prior.together)
+        owner, like = model.owner, model.measurement_cov
+        prior = arms if isinstance(arms, ArmPrior) else _prior_of(owner, arms, like)
         density = derived(
             owner,
-            ("arm density", self.prior.broad, like.device),
-            sources,
-            lambda: DirectionDensity(self.prior, like.device),
+            ("arm density", prior.broad, like.device),
+            (*prior.directions.parameters_tuple(), prior.log_mass, prior.together),
+            lambda: DirectionDensity(prior, like.device),
         )
         self.ahead = frames_of_reach(model.rate, model.smoothing)
         self.stride = max(1, round(_SHARE * model.rate))
@@ -230,8 +227,8 @@ class ArticulatedFilter(Estimator):
         self.lengths = derived(
             owner,
             ("body lengths", hand, neck, known.key),
-            (like, self.prior.lengths, self.prior.spread),
-            lambda: BodyLengths(self.prior, hand, neck, known, like),
+            (like, prior.lengths, prior.spread),
+            lambda: BodyLengths(prior, hand, neck, known, like),
         )
         self.optics = derived(
             owner,
@@ -245,18 +242,31 @@ class ArticulatedFilter(Estimator):
         self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
     ) -> ArticulatedState:
         """Return the state before the first frame; see `Estimator`."""
+        begun = self._before_any_frame(batch_size)
+        root = begun["root"]
+        return ArticulatedState(
+            **begun,
+            roots=None,
+            arms=None,
+            middle=root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1),
+            tilt=roll(lean_angle(begun["lean"])),
+            frame=0,
+            starts=torch.full((batch_size,), self.starts, device=root.device),
+        )
+
+    def _before_any_frame(self, batch_size: int) -> dict[str, Any]:
+        """Return what a state holds of torso and lengths before any frame."""
         root = self.grid.init(batch_size, self.lengths.size_spread)
         moments = self.grid.moments(root)
         lengths = self.lengths.init(batch_size, moments.of_size)
-        sizes = self.lengths.sizes(lengths)
-        middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
-        lean = root.new_zeros(batch_size, 2)
-        starts = torch.full((batch_size,), self.starts, device=root.device)
-        tilt = roll(lean_angle(lean))
-        size = SeenSize.unknown(batch_size, root)
-        return ArticulatedState(
-            root, None, size, moments, lengths, sizes, None, middle, lean, tilt, 0, starts
-        )
+        return {
+            "root": root,
+            "seen_size": SeenSize.unknown(batch_size, root),
+            "moments": moments,
+            "lengths": lengths,
+            "sizes": self.lengths.sizes(lengths),
+            "lean": root.new_zeros(batch_size, 2),
+        }
 
     def advance(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
@@ -457,13 +467,7 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, chosen: Bool[Tensor, " B"]
     ) -> ArticulatedState:
         """Return the state in which torso and lengths of the chosen bodies are as before any frame."""
-        root = self.grid.init(len(chosen), self.lengths.size_spread)
-        moments = self.grid.moments(root)
-        lengths = self.lengths.init(len(chosen), moments.of_size)
-        begun = {
-            "root": root, "seen_size": SeenSize.unknown(len(chosen), root), "moments": moments,
-            "lengths": lengths, "sizes": self.lengths.sizes(lengths), "lean": torch.zeros_like(state.lean),
-        }  # fmt: skip
+        begun = self._before_any_frame(len(chosen))
         fields = {name: _where(chosen, new, getattr(state, name)) for name, new in begun.items()}
         return state._replace(**fields)
 
@@ -478,15 +482,14 @@ class ArticulatedFilter(Estimator):
         seen, arms = together(found)
         told = self._told(seen, told)
         frame = upright(seen.frame, seen.facts, seen.tilt)
-        torso, turn = seen.sizes.torso, self.grid.turn
         body = SeenBody(
             joints=torso_joints(
                 frame,
                 seen.root,
                 seen.middle,
                 seen.shoulders[:, :, 0],
-                torso,
-                turn,
+                seen.sizes.torso,
+                self.grid.turn,
                 self.neck_between,
             ),
             shoulders=seen.frame.torso[:, :2],
@@ -533,7 +536,7 @@ def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:
     return type(old)(*(_where(chosen, *both) for both in zip(new, old, strict=True)))
 
 
-def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:
+def _prior_of(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:
     """Return the prior of a file, read once for each tracker, or that of the package."""
     if not path:
         return shipped_arm_prior()

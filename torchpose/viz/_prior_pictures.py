@@ -203,12 +203,10 @@ def _draw_components(
         weight_bar(ax, component.weight, share)
 
 
-def _draw_arms(
-    ax: Axes, arms: Float[Tensor, "N 5 2"], side: str, linewidth: float = 0.6, alpha: float = 0.22
-) -> None:
+def _draw_arms(ax: Axes, arms: Float[Tensor, "N 5 2"], side: str, alpha: float = 0.22) -> None:
     """Draw thin lines from shoulder to hand."""
     flat = to_numpy(arms[:, :3])
-    ax.plot(flat[..., 0].T, flat[..., 1].T, color=SIDE_COLORS[side], linewidth=linewidth,
+    ax.plot(flat[..., 0].T, flat[..., 1].T, color=SIDE_COLORS[side], linewidth=0.6,
             alpha=alpha, zorder=1)  # fmt: skip
 
 

@@ -29,8 +29,8 @@ class Duplicate(NamedTuple):
     shared: float
 
 
-def find_duplicates(recordings: Sequence[Recording], shared: float = _SHARED) -> list[Duplicate]:
-    """Find pairs of recordings that share at least this part of the shorter one's frames.
+def find_duplicates(recordings: Sequence[Recording]) -> list[Duplicate]:
+    """Find pairs of recordings that share at least half of the shorter one's frames.
 
     A frame is its eight joints relative to the neck, rounded to 2 cm, as a hash of 64 bits; so copies
     are found that were moved, cut, renamed, or written in whole millimetres. A copy that was turned,
@@ -54,7 +54,7 @@ def find_duplicates(recordings: Sequence[Recording], shared: float = _SHARED) ->
     return [
         Duplicate(first, second, part)
         for (first, second), part in zip(found.tolist(), share.tolist(), strict=True)
-        if part >= shared
+        if part >= _SHARED
     ]
 
 

@@ -220,11 +220,18 @@ class KeypointTracker(nn.Module):
         found = self._started(frame, lifted)
         never = torch.full_like(frame.inlier[:, 0], torch.inf)
         stream = KeypointStream(
-            found.state, begun, torch.zeros_like(count), torch.full_like(begun, NOBODY, dtype=torch.long),
-            memory, CameraFaults.none(frame), SizeBelief.usual(self.size_std, count),
-            torch.zeros_like(never), never, torch.zeros_like(begun),
-            torch.zeros_like(found.state.log_odds),
-        )  # fmt: skip
+            state=found.state,
+            begun=begun,
+            lost=torch.zeros_like(count),
+            alone=torch.full_like(begun, NOBODY, dtype=torch.long),
+            memory=memory,
+            faults=CameraFaults.none(frame),
+            size=SizeBelief.usual(self.size_std, count),
+            spread=torch.zeros_like(never),
+            unseen=never,
+            coasting=torch.zeros_like(begun),
+            own_sides=torch.zeros_like(found.state.log_odds),
+        )
         return self._with_lifted(stream, lifted, found), found, begun
 
     def _next(

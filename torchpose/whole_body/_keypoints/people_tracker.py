@@ -274,8 +274,8 @@ class PeopleTracker:
         zero = poses.log_evidence.new_zeros(len(groups))
         n_begun = stream.n_begun + len(groups)
         beginners = PeopleStream(
-            bodies, number, n_begun, zero, zero, zero, zero, zero > 0, identity, stream.n_confirmed,
-            stream.faults,
+            bodies, number, n_begun, hits=zero, missed=zero, unseen=zero, doubled=zero, away=zero > 0,
+            identity=identity, n_confirmed=stream.n_confirmed, faults=stream.faults,
         )  # fmt: skip
         rows, keep = (flags.nonzero().squeeze(-1) for flags in (sure, ~owner[:, sure].any(-1)))
         stream = self._kept(stream, keep)._replace(n_begun=n_begun)
@@ -341,7 +341,10 @@ class PeopleTracker:
 
 def _nobody(frame: KeypointFrame) -> PeopleStream:
     none = frame.inlier.new_zeros(0)
-    return PeopleStream(None, none.long(), 0, none, none, none, none, none > 0, none.long(), 0)
+    return PeopleStream(
+        None, none.long(), 0, hits=none, missed=none, unseen=none, doubled=none, away=none > 0,
+        identity=none.long(), n_confirmed=0,
+    )  # fmt: skip
 
 
 def _owners(
