@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -41,6 +41,7 @@ class FileKind(Generic[Info]):
         tensors: sizes of each floating-point tensor by its name, such as {"mean": "E 3",
             "covariance": "E 3 3"}; a letter stands for the same size in all of them.
         indices: the same of tensors of whole numbers. Where both are empty any tensors will do.
+        newer: which tensors files of older versions may lack.
         positive, covariances: which tensors hold deviations or scales, and which covariances.
         unknown: which tensors are NaN, as a whole, as long as they are not known; all others are finite.
     """
@@ -51,6 +52,7 @@ class FileKind(Generic[Info]):
     older: tuple[int, ...] = ()
     tensors: Mapping[str, str] = field(default_factory=dict)
     indices: Mapping[str, str] = field(default_factory=dict)
+    newer: tuple[str, ...] = ()
     positive: tuple[str, ...] = ()
     covariances: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
@@ -115,7 +117,8 @@ def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str
             }
         header = json.loads(metadata.get(_HEADER, "null"))
         info = info_from_json(kind.info, _checked_info(header, kind))
-        _check_tensors(tensors, kind)
+        lacking = () if header["version"] == kind.version else kind.newer
+        _check_tensors(tensors, kind, [name for name in lacking if name not in tensors])
         _check_values(tensors, kind)
     return info, tensors
 
@@ -211,11 +214,14 @@ def _checked_info(header: Any, kind: FileKind[Any]) -> str:
     return str(header.get("info"))
 
 
-def _check_tensors(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
-    """Raise `FileFormatError` unless the tensors are those of the kind."""
+def _check_tensors(
+    tensors: Mapping[str, Tensor], kind: FileKind[Any], lacking: Sequence[str] = ()
+) -> None:
+    """Raise `FileFormatError` unless the tensors are those of the kind, some of which may be lacking."""
     expected = {**kind.tensors, **kind.indices}
     if not expected:
         return
+    expected = {name: text for name, text in expected.items() if name not in lacking}
     if tensors.keys() != expected.keys():
         raise FileFormatError(
             f"expected the tensors {', '.join(sorted(expected))}, found "

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpose.body._articulation import Articulation, mirror_of
 from torchpose.errors import InputError
 from torchpose.learning._motion_dynamics import (
+    fit_correlation,
     fit_shifts,
     fit_velocities,
     long_enough,
@@ -100,6 +101,7 @@ def fit_body_motion(
         scale_cov,
         _fit_poses(articulation, sets, recipe),
         articulation=articulation,
+        correlation=fit_correlation(articulation, sets, decay),
     )
 
 

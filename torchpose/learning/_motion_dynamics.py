@@ -21,6 +21,7 @@ from torchpose.learning._motion_sequences import (
 _NEAR, _FAR = 1 / 30, 1 / 15  # seconds, lags between which velocities tell their decay
 _DECAYS = (0.3, 15.0)  # per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5
+_CORRELATED = 0.9  # share of the correlations that other recordings are expected to have
 _SHIFT_LAG = 0.2  # seconds
 _SHIFT_TIMES = (0.05, 5.0)  # seconds; the shape of a person is for ever
 _USUAL_SHIFT_TIME = 0.5  # seconds, where trunks are rigid
@@ -92,6 +93,38 @@ def squared_accelerations(
     articulation: Articulation, sequences: Sequence[MotionSequence], decay: Tensor
 ) -> Float[Tensor, " V"]:
     """Return the squares of the accelerations of a set."""
+    changes = _accelerations(articulation, sequences, decay)
+    return changes.square().mean(0).clamp_min(_LEAST_ACCELERATION**2)
+
+
+def fit_correlation(
+    articulation: Articulation, sets: MotionSets, decay: Float[Tensor, " V"]
+) -> Float[Tensor, "V V"]:
+    """Return how accelerations of angles correlate, those of mirrored bodies among them, mean over the sets.
+
+    The position has none, since its axes are those of the world. Columns that a set does not tell have none
+    in it.
+
+    Args:
+        articulation: of the bodies. sets: recordings. decay: of the velocities.
+    """
+    mirror = mirror_of(articulation)
+    found = torch.zeros(len(decay), len(decay), dtype=torch.float64)
+    for own in sets.values():
+        told = known_columns(articulation, own)[3:].double()
+        changes = _accelerations(articulation, own, decay)[:, 3:]
+        cov = changes.mT @ changes
+        cov = cov + cov[mirror.columns][:, mirror.columns] * torch.outer(mirror.sign, mirror.sign)
+        size = cov.diagonal().sqrt().clamp_min(_LEAST_ACCELERATION)
+        found[3:, 3:] += cov / torch.outer(size, size) * torch.outer(told, told) / len(sets)
+    found = _CORRELATED * found
+    return found.fill_diagonal_(1.0)
+
+
+def _accelerations(
+    articulation: Articulation, sequences: Sequence[MotionSequence], decay: Tensor
+) -> Float[Tensor, "T V"]:
+    """Return the accelerations between frames of a set, per root of a second."""
     changes = []
     for sequence in sequences:
         v = _velocities(articulation, sequence)
@@ -99,7 +132,7 @@ def squared_accelerations(
         kept = torch.exp(-x)
         share = (2 * (x - 1 + kept) - (1 - kept).square()) / (decay * x.square())
         changes.append((v[1:] - v[:-1]) / share.sqrt())
-    return torch.cat(clipped(changes)).square().mean(0).clamp_min(_LEAST_ACCELERATION**2)
+    return torch.cat(clipped(changes))
 
 
 def _geometric_mean(values: Float[Tensor, "K V"], told: Bool[Tensor, "K V"]) -> Tensor:

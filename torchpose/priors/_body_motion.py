@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_covariance, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
@@ -44,14 +44,17 @@ class BodyMotionInfo:
 
 _KIND = FileKind(
     "torchpose-body-motion",
-    1,
+    2,
     BodyMotionInfo,
+    older=(1,),
     tensors={
-        "acceleration": "V", "decay": "V", "shift_std": "S", "shift_time": "1", "pull_time": "1",
-        "scale_mean": "G", "scale_cov": "G G", "weights": "K", "means": "K Q", "covariances": "K Q Q",
+        "acceleration": "V", "correlation": "V V", "decay": "V", "shift_std": "S", "shift_time": "1",
+        "pull_time": "1", "scale_mean": "G", "scale_cov": "G G", "weights": "K", "means": "K Q",
+        "covariances": "K Q Q",
     },
+    newer=("correlation",),
     positive=("acceleration", "decay", "shift_std", "shift_time", "pull_time", "weights"),
-    covariances=("scale_cov", "covariances"),
+    covariances=("correlation", "scale_cov", "covariances"),
 )  # fmt: skip
 
 
@@ -65,7 +68,8 @@ class PosePull(NamedTuple):
 class BodyMotion(nn.Module):
     """Holds a prior over the motion, poses and proportions of articulated bodies.
 
-    - Velocities v of root and angles are Ornstein-Uhlenbeck processes, dv = -decay v dt + acceleration dW.
+    - Velocities v of root and angles are Ornstein-Uhlenbeck processes, dv = -decay v dt + acceleration dW,
+      where the Wiener processes W are correlated: the trunk stays where the pelvis turns, and feet do.
     - Joints of the trunk shift from where a rigid part has them, as processes about zero with the standard
       deviation `shift_std` and the time `shift_time`.
     - Angles of all parts but the root have a mixture of Gaussians as density, towards which they tend within
@@ -78,12 +82,14 @@ class BodyMotion(nn.Module):
         shift_std: [S], metres, along each axis. shift_time, pull_time: seconds.
         scale_mean: [G]. scale_cov: [G, G]. poses: mixture over the Q `relative_angles` of `Articulation`.
         info: facts about the fit. articulation: of the bodies.
+        correlation: [3 + R, 3 + R], of the accelerations; None is none.
 
     Raises:
         ShapeError: sizes other than the articulation's. PriorError: what must be positive is not.
     """
 
     acceleration: Tensor
+    correlation: Tensor
     decay: Tensor
     shift_std: Tensor
     shift_time: Tensor
@@ -103,10 +109,15 @@ class BodyMotion(nn.Module):
         poses: GaussianMixture,
         info: BodyMotionInfo | None = None,
         articulation: Articulation | None = None,
+        correlation: Float[Tensor, "V V"] | None = None,
     ) -> None:
         super().__init__()
         self.articulation = articulation or Articulation()
         body = self.articulation
+        if correlation is None:
+            correlation = torch.eye(body.n_pose).to(acceleration)
+        check_shape("correlation", correlation, [body.n_pose, body.n_pose])
+        check_covariance("correlation", correlation)
         columns = body.relative_columns
         check_shape("acceleration", acceleration, [body.n_pose])
         check_shape("decay", decay, [body.n_pose])
@@ -122,6 +133,7 @@ class BodyMotion(nn.Module):
             if not bool((value > 0).all()):
                 raise PriorError(f"{name} must be positive, got {value.tolist()}")
             register_given(self, name, value.double())
+        register_given(self, "correlation", correlation.double())
         register_given(self, "scale_mean", scale_mean.double())
         register_given(self, "scale_cov", scale_cov.double())
         self.poses, self.info = poses, info or BodyMotionInfo()

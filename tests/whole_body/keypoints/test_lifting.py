@@ -107,7 +107,10 @@ def state_of(motion):
     scales = body.columns["scales"]
     cov[scales, scales] *= 1e-6
     new = point.position.new_zeros
-    return filter, BodyGaussian(point, cov[None], new(1, 1, 2), new(1, 1), new(1, 15), new(1, 1))
+    state = BodyGaussian(
+        point, cov[None], new(1, 1, 2), new(1, 1), new(1, 15), new(1, 1), new(1, 15, 3)
+    )
+    return filter, state
 
 
 def lifted_from(joints, std, off=(0.0, 0.0, 0.0)):

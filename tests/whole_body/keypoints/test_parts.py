@@ -110,8 +110,9 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     new = point.position.new_full
     of_cameras = new((1, 3), 1.0)
     state = BodyGaussian(
-        point, cov, new((1, 3, 2), -50.0), of_cameras, new((1, 15), -5.0), of_cameras
-    )
+        point, cov, new((1, 3, 2), -50.0), of_cameras, new((1, 15), -5.0), of_cameras,
+        new((1, 15, 3), torch.nan),
+    )  # fmt: skip
     frame = frame_of(given)
     found = BodyKalmanFilter(motion, given.rig, 30.0).correct(state, frame, (1.0,))
 

@@ -70,6 +70,7 @@ FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
 
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
+_AGAIN = 0.1  # metres, from where cameras agreed on such a joint to where they do one frame later
 _CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which no camera sees a hip
 _HELD = 20.0  # shares of the information about the lean of a trunk that such a body gets
 _HELD_PELVIS = 2.0  # and about that of its pelvis
@@ -92,6 +93,7 @@ class BodyGaussian(NamedTuple):
         log_odds: [B, C, 2], of exchanged sides of arms and legs. scale: [B, C], of the cameras' noise.
         doubt: [B, J], log-odds of a joint elsewhere than the prediction has it.
         told: [B, C], number of frames whose mean the scale is, at most; the usual noise counts as some.
+        agreed: [B, J, 3], where cameras agreed in the frame on a joint that was not expected there, else NaN.
     """
 
     mean: BodyPoint
@@ -100,6 +102,7 @@ class BodyGaussian(NamedTuple):
     scale: Tensor
     doubt: Tensor
     told: Tensor
+    agreed: Tensor
 
     @property
     def beliefs(self) -> Beliefs:
@@ -122,6 +125,13 @@ class CorrectedBody(NamedTuple):
     weighed: Weighed
     log_evidence: Tensor
     widened: Tensor
+
+
+class _Elsewhere(NamedTuple):
+    """Holds the log-evidence of joints elsewhere than predicted [B, J], and where cameras agree [B, J, 3]."""
+
+    log_evidence: Tensor
+    agreed: Tensor
 
 
 class _Linearised(NamedTuple):
@@ -197,7 +207,8 @@ class BodyKalmanFilter(nn.Module):
         """Return what the model of one frame is made of."""
         motion = self.motion
         return (
-            motion.acceleration, motion.decay, motion.shift_std, motion.shift_time, motion.pull_time,
+            motion.acceleration, motion.correlation, motion.decay, motion.shift_std, motion.shift_time,
+            motion.pull_time,
         )  # fmt: skip
 
     @property
@@ -311,8 +322,8 @@ class BodyKalmanFilter(nn.Module):
     ) -> CorrectedBody:
         """Return the posterior of a prediction, from a wider one where a joint has jumped."""
         found = self._linearised(state, state.mean, readings)
-        doubt, jumped = self._doubts(state, readings, found)
-        state = state._replace(doubt=doubt)
+        doubt, jumped, agreed = self._doubts(state, readings, found)
+        state = state._replace(doubt=doubt, agreed=agreed)
         corrected = self._iterated(state, readings, (1.0,) * self.n_iterations, found)
         rows = jumped.any(-1).nonzero().squeeze(-1)
         if not len(rows):
@@ -364,7 +375,7 @@ class BodyKalmanFilter(nn.Module):
         rows = wrong.flatten(1).any(-1).nonzero().squeeze(-1)
         limbs = wrong.any(1).to(state.cov) @ self.exchange.groups.to(state.cov) > 0
         exchanged = corrected.weighed.exchanged.masked_fill(wrong, self.transition.begin)
-        state = state._replace(doubt=corrected.state.doubt)
+        state = state._replace(doubt=corrected.state.doubt, agreed=corrected.state.agreed)
         return self._recovered(corrected, state, frame, limbs, rows, exchanged)
 
     def _iterated(
@@ -441,6 +452,7 @@ class BodyKalmanFilter(nn.Module):
             scale,
             state.doubt,
             told,
+            state.agreed,
         )
         evidence = weighed.log_evidence + fit
         return CorrectedBody(
@@ -499,27 +511,27 @@ class BodyKalmanFilter(nn.Module):
 
     def _doubts(
         self, state: BodyGaussian, readings: KeypointFrame, found: _Linearised
-    ) -> tuple[Float[Tensor, "B J"], Bool[Tensor, "B J"]]:
-        """Return the log-odds of joints elsewhere than predicted, given the keypoints, and which are."""
+    ) -> tuple[Float[Tensor, "B J"], Bool[Tensor, "B J"], Float[Tensor, "B J 3"]]:
+        """Return the log-odds of joints elsewhere than predicted, which are, and where cameras agree."""
         far = point_blocks(found.G) + _JUMP**2 * unit(3, found.G)
         at_large = weigh(
             readings, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
         )
-        elsewhere = at_large.log_joint.sum(-2)
+        elsewhere = _Elsewhere(at_large.log_joint.sum(-2), torch.full_like(state.agreed, torch.nan))
         if len(self.maps.shift) > 1:
             elsewhere = self._or_where_agreed(elsewhere, state, readings, found, far)
-        doubt = state.doubt + elsewhere - found.weighed.log_joint.sum(-2)
+        doubt = state.doubt + elsewhere.log_evidence - found.weighed.log_joint.sum(-2)
         jumped = doubt > 0
-        return torch.where(jumped, _NO_DOUBT, doubt), jumped
+        return torch.where(jumped, _NO_DOUBT, doubt), jumped, elsewhere.agreed
 
     def _or_where_agreed(
         self,
-        elsewhere: Float[Tensor, "B J"],
+        elsewhere: _Elsewhere,
         state: BodyGaussian,
         readings: KeypointFrame,
         found: _Linearised,
         far: Float[Tensor, "B J 3 3"],
-    ) -> Float[Tensor, "B J"]:
+    ) -> _Elsewhere:
         """Return the log-evidence of joints elsewhere, at least that of where cameras agree.
 
         That counts for joints that several cameras see, of which the prediction accepts one at most.
@@ -529,16 +541,20 @@ class BodyKalmanFilter(nn.Module):
         if not bool(unsure.any()):
             return elsewhere
         exchanged = found.weighed.exchanged > 0.5
-        agreed = self._log_evidence_where_agreed(state, readings, far, exchanged)
-        return torch.where(unsure, torch.maximum(elsewhere, agreed), elsewhere)
+        evidence, agreed = self._where_agreed(state, readings, far, exchanged)
+        likelier = torch.maximum(elsewhere.log_evidence, evidence)
+        return _Elsewhere(
+            torch.where(unsure, likelier, elsewhere.log_evidence),
+            agreed.masked_fill(~unsure[..., None], torch.nan),
+        )
 
-    def _log_evidence_where_agreed(
+    def _where_agreed(
         self,
         state: BodyGaussian,
         readings: KeypointFrame,
         far: Float[Tensor, "B J 3 3"],
         exchanged: Bool[Tensor, "B C 2"],
-    ) -> Float[Tensor, "B J"]:
+    ) -> _Elsewhere:
         """Return the log-evidence of keypoints for joints that are where cameras agree, -inf where none do.
 
         A joint may be off along the ray of one camera, which then takes it for right, while another one
@@ -556,12 +572,34 @@ class BodyKalmanFilter(nn.Module):
         frame = readings.map(lambda value: value[0])
         place = triangulate(self.maps, with_sides_exchanged(frame, exchanged, self.exchange))
         known = place.isfinite().all(-1)
-        place = torch.where(known[..., None], place, predicted)
+        agreed, place = place, torch.where(known[..., None], place, predicted)
         seen = see(self.maps, place)
         weighed = weigh(readings, seen, self.maps, state.beliefs, self.exchange)
         W, _ = information(readings, seen, weighed)
-        L = torch.linalg.cholesky(far)
-        off = torch.linalg.solve_triangular(L, (place - predicted)[..., None], upper=False)
-        spread = torch.linalg.cholesky(plus_one(L.mT @ W @ L)).diagonal(dim1=-2, dim2=-1).log()
-        fit = -0.5 * off.square().sum((-2, -1)) - spread.sum(-1)
-        return (weighed.log_joint.sum(-2) + fit).masked_fill(~known, -math.inf)
+        fit = torch.maximum(_log_fit(place - predicted, far, W), self._fit_again(state, place, W))
+        return _Elsewhere((weighed.log_joint.sum(-2) + fit).masked_fill(~known, -math.inf), agreed)
+
+    def _fit_again(
+        self, state: BodyGaussian, place: Float[Tensor, "B J 3"], W: Float[Tensor, "B J 3 3"]
+    ) -> Float[Tensor, "B J"]:
+        """Return the log of how well joints are where they were elsewhere one frame before, -inf if nowhere.
+
+        Cameras that agree on one place for several frames pay only once for a joint that may be anywhere. Of
+        the predicted log-odds the share counts that is of joints which were elsewhere before.
+        """
+        before = state.agreed.isfinite().all(-1)
+        off = torch.where(before[..., None], place - state.agreed, 0.0)
+        near = _AGAIN**2 * unit(3, W).expand_as(W)
+        odds = state.doubt.sigmoid()
+        stayed = (1 - self.transition.lost / odds).clamp_min(_ODDS).log()
+        return (stayed + _log_fit(off, near, W)).masked_fill(~before, -math.inf)
+
+
+def _log_fit(
+    off: Float[Tensor, "B J 3"], S: Float[Tensor, "B J 3 3"], W: Float[Tensor, "B J 3 3"]
+) -> Float[Tensor, "B J"]:
+    """Return -off^T S^-1 off / 2 - log |1 + S W| / 2."""
+    L = torch.linalg.cholesky(S)
+    off = torch.linalg.solve_triangular(L, off[..., None], upper=False)
+    spread = torch.linalg.cholesky(plus_one(L.mT @ W @ L)).diagonal(dim1=-2, dim2=-1).log()
+    return -0.5 * off.square().sum((-2, -1)) - spread.sum(-1)

@@ -69,9 +69,10 @@ def transition(
     """Return the model of a frame of dt seconds.
 
     Position and angles: x' = x + b v,  v' = a v,  a = exp(-decay dt),  b = (1 - a) / decay, with the noise of
-    white acceleration q,
+    white accelerations q, that are correlated. With the covariance Q of these, and c = (1 - a_i a_j) /
+    (decay_i + decay_j), the covariances of the noise of i and j are
 
-        q^2 [(dt - 2 b + (1 - a^2) / (2 decay)) / decay^2,  b^2 / 2;  b^2 / 2,  (1 - a^2) / (2 decay)].
+        Q_ij [(dt - b_i - b_j + c) / (decay_i decay_j),  (b_j - c) / decay_i;  (b_i - c) / decay_j,  c].
 
     Args:
         motion: how bodies move. dt: seconds. decay: 1/s, of other velocities than the motion's.
@@ -83,13 +84,16 @@ def transition(
     noise = torch.zeros_like(matrix)
     pose, velocity = torch.arange(body.n_pose), _index(at["velocity"])
     keep = torch.exp(-decay * dt)
-    matrix[pose, velocity] = (1 - keep) / decay
-    matrix[velocity, velocity] = keep
-    power = motion.acceleration.square()
     gone = (1 - keep) / decay
-    noise[pose, pose] = power / decay.square() * (dt - 2 * gone + (1 - keep.square()) / (2 * decay))
-    noise[pose, velocity] = noise[velocity, pose] = power * gone.square() / 2
-    noise[velocity, velocity] = power * (1 - keep.square()) / (2 * decay)
+    matrix[pose, velocity] = gone
+    matrix[velocity, velocity] = keep
+    power = motion.correlation * torch.outer(motion.acceleration, motion.acceleration)
+    together = (1 - torch.outer(keep, keep)) / (decay[:, None] + decay)
+    both = power / torch.outer(decay, decay) * (dt - gone[:, None] - gone + together)
+    across = power / decay[:, None] * (gone - together)
+    noise[: body.n_pose, : body.n_pose] = both
+    noise[: body.n_pose, at["velocity"]], noise[at["velocity"], : body.n_pose] = across, across.mT
+    noise[at["velocity"], at["velocity"]] = power * together
     shifts = _index(at["shifts"])
     held = torch.exp(-dt / motion.shift_time)
     matrix[shifts, shifts] = held

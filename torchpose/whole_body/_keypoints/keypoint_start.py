@@ -192,6 +192,7 @@ def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps, fps: flo
         new((count, n_cameras), 1.0),
         new((count, len(BODY_15.names)), _DOUBT),
         new((count, n_cameras), told),
+        new((count, len(BODY_15.names), 3), torch.nan),
     )
 
 
