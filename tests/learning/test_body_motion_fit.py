@@ -42,10 +42,15 @@ def walk(
     seed: int = 0,
     person: str = "a#1",
     size: float = 1.0,
+    mix: torch.Tensor | None = None,
 ) -> MotionSequence:
-    """Somebody whose position and angles are Ornstein-Uhlenbeck processes, as are the joints of the trunk."""
+    """Somebody whose position and angles are Ornstein-Uhlenbeck processes, as are the joints of the trunk.
+
+    They are linear combinations `mix` of independent ones.
+    """
     g = torch.Generator().manual_seed(seed)
     steps = velocity_steps(articulation.n_pose, frames, fps, acceleration, g)
+    steps = steps if mix is None else steps @ mix.mT
     turns = articulation._turns(steps[:, 3:])
     rotations = [torch.eye(3).double().expand_as(turns[0])]
     for turn in turns:
@@ -123,6 +128,32 @@ def test_processes_come_back(articulation, fps):
     )
     assert float(found.shift_time) == pytest.approx(SHIFT_TIME, rel=0.25)
     assert acceleration_ratio(found, sequences) == pytest.approx(1, abs=0.05)
+
+
+def test_correlations_come_back_with_their_mirror_images(articulation):
+    """A thigh and a shank that swing against each other on the left do so on both sides."""
+    n, mirror = articulation.n_pose, mirror_of(articulation)
+    thigh, shank = (
+        3 + int((articulation.axis_part == articulation.skeleton.part(name)).nonzero()[0])
+        for name in ("left_thigh", "left_shank")
+    )
+    mix = torch.eye(n, dtype=torch.float64)
+    mix[shank, thigh], mix[shank, shank] = -0.8, 0.6
+    sequences = [
+        walk(articulation, seed=seed, person=f"{name}#{seed}", mix=mix)
+        for name in "ab"
+        for seed in range(3)
+    ]
+    sequences = [
+        s if s.origin == "a" else without(s, articulation, "left_ankle") for s in sequences
+    ]
+    found = fit_body_motion(sequences, QUICK).correlation
+    other = 3 + mirror.columns[[thigh - 3, shank - 3]]
+    expected = 0.9 * -0.8 / 2 / 2  # of one side and of one set in two
+    for i, j in ((thigh, shank), tuple(other.tolist())):
+        assert float(found[i, j]) == pytest.approx(expected, abs=0.03)
+        found[i, j] = found[j, i] = 0
+    torch.testing.assert_close(found, torch.eye(n).double(), atol=0.06, rtol=0)
 
 
 def test_a_glitch_changes_little(articulation):

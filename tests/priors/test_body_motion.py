@@ -1,13 +1,22 @@
 """The prior over the motion of bodies: its file, what it refuses, and how poses pull."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from tests.priors.mixtures import random_mixture
 from tests.priors.motions import some_body_motion
-from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
+from torchpose._core.tensor_file import write_tensors
+from torchpose.errors import (
+    CovarianceError,
+    FileFormatError,
+    InputError,
+    PriorError,
+    ShapeError,
+)
 from torchpose.priors import GaussianMixture
-from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
+from torchpose.priors._body_motion import _KIND, BodyMotion, BodyMotionInfo
 from torchpose.priors._shipped import load_body_motion
 
 
@@ -26,6 +35,19 @@ def test_a_file_brings_it_back(tmp_path):
         BodyMotion.load(path)
     path.write_bytes(whole.replace(b"torchpose-body-motion", b"torchpose-body-notion"))
     with pytest.raises(FileFormatError, match="body-motion"):
+        BodyMotion.load(path)
+
+
+def test_an_older_file_has_no_correlation(tmp_path):
+    motion, path = some_body_motion(), tmp_path / "old.safetensors"
+    given = {
+        n: getattr(motion, n) for n in _KIND.tensors if n != "correlation" and hasattr(motion, n)
+    }
+    given |= {n: getattr(motion.poses, n) for n in ("weights", "means", "covariances")}
+    write_tensors(path, replace(_KIND, version=1), motion.info, given)
+    assert bool((BodyMotion.load(path).correlation == torch.eye(27).double()).all())
+    write_tensors(path, _KIND, motion.info, given)
+    with pytest.raises(FileFormatError, match=r"expected the tensors .*correlation"):
         BodyMotion.load(path)
 
 
@@ -48,6 +70,8 @@ def test_the_shipped_one_is_of_the_body_that_is_tracked():
     [
         ({"decay": torch.zeros(27).double()}, PriorError, "decay must be positive"),
         ({"acceleration": torch.ones(3).double()}, ShapeError, "acceleration"),
+        ({"correlation": torch.eye(3).double()}, ShapeError, "correlation"),
+        ({"correlation": -torch.eye(27).double()}, CovarianceError, "correlation"),
         ({"shift_std": torch.ones(9).double()}, ShapeError, "shift_std"),
         ({"scale_cov": torch.eye(2).double()}, ShapeError, "scale_cov"),
         ({"poses": random_mixture(2, 5)}, ShapeError, "means"),

@@ -102,8 +102,8 @@ def fit_correlation(
 ) -> Float[Tensor, "V V"]:
     """Return how accelerations of angles correlate, those of mirrored bodies among them, mean over the sets.
 
-    The position has none, since its axes are those of the world. Columns that a set does not tell have none
-    in it.
+    The position has none, since its axes are those of the world. Columns that a set does not tell on both
+    sides have none in it.
 
     Args:
         articulation: of the bodies. sets: recordings. decay: of the velocities.
@@ -111,7 +111,8 @@ def fit_correlation(
     mirror = mirror_of(articulation)
     found = torch.zeros(len(decay), len(decay), dtype=torch.float64)
     for own in sets.values():
-        told = known_columns(articulation, own)[3:].double()
+        told = known_columns(articulation, own)[3:]
+        told = (told & told[mirror.columns]).double()
         changes = _accelerations(articulation, own, decay)[:, 3:]
         cov = changes.mT @ changes
         cov = cov + cov[mirror.columns][:, mirror.columns] * torch.outer(mirror.sign, mirror.sign)

@@ -86,6 +86,7 @@ class BodyMotion(nn.Module):
 
     Raises:
         ShapeError: sizes other than the articulation's. PriorError: what must be positive is not.
+        CovarianceError: correlations that are none.
     """
 
     acceleration: Tensor

@@ -270,12 +270,17 @@ def misled():
 
 def _with_a_forearm_along_the_view(two):
     """A forearm that points away from the first camera instead of towards it, which looks the same there."""
-    wrist, elbow = J("right_wrist"), J("right_elbow")
+    return _with_a_bone_along_the_view(two, "right_wrist")
+
+
+def _with_a_bone_along_the_view(two, name):
+    """A last bone of a limb that is mirrored in depth before the first camera, which sees no difference."""
+    end, start = J(name), BODY_15.parents[J(name)]
     joints = two.joints.clone()
     place = -two.rig.rotation[0].mT @ two.rig.translation[0]
-    ray = torch.nn.functional.normalize(joints[12:, wrist] - place, dim=-1)
-    depth = ((joints[12:, wrist] - joints[12:, elbow]) * ray).sum(-1, keepdim=True)
-    joints[12:, wrist] -= 2 * depth * ray
+    ray = torch.nn.functional.normalize(joints[12:, end] - place, dim=-1)
+    depth = ((joints[12:, end] - joints[12:, start]) * ray).sum(-1, keepdim=True)
+    joints[12:, end] -= 2 * depth * ray
     return joints, two.keypoints + two.rig(joints).pixels - two.rig(two.joints).pixels
 
 
@@ -284,6 +289,16 @@ def test_a_joint_is_found_where_two_cameras_agree_though_one_had_it_elsewhere(mi
     wrong = errors(found, joints)[:, J("right_wrist")]
     assert float(wrong[12]) > 0.1 and float(wrong[16:].max()) < 0.05
     assert (found.details["inlier"][16:, :, J("right_wrist")] > 0.9).all()
+
+
+@pytest.mark.parametrize("confidence", [0.7, 0.35])
+def test_a_joint_is_found_where_cameras_agree_for_some_frames_of_which_none_tells(confidence):
+    two = scene(2, 22)
+    joints, keypoints = _with_a_bone_along_the_view(two, "right_ankle")
+    doubtful = torch.full_like(two.confidence, confidence)
+    found = tracker(two.rig)(keypoints=keypoints, confidence=doubtful)
+    wrong = errors(found, joints)[:, J("right_ankle")]
+    assert float(wrong[13]) > 0.4 and float(wrong[17:].max()) < 0.05
 
 
 def test_a_body_begins_right_though_one_of_two_cameras_exchanges_its_legs(misled):
