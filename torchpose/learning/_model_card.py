@@ -349,11 +349,11 @@ def _body_motion(motion: Any, call: str) -> _Told:
     n_poses = len(motion.poses.weights)
     what = (
         "How fast position and angles of a body accelerate, how these accelerations correlate, and how "
-        "velocities decay (Ornstein-Uhlenbeck processes), how far neck, shoulders and hips shift from rigid parts, mean and "
-        f"covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians over the "
-        "angles of all parts, half of them mirror images of the others. The Kalman filter over bodies from "
-        "keypoints uses it. Every set of recordings counts alike, except that poses have shares as the roots "
-        "of durations."
+        "velocities decay (Ornstein-Uhlenbeck processes), how far neck, shoulders and hips shift from rigid "
+        f"parts, mean and covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians "
+        "over the angles of all parts, half of them mirror images of the others. The Kalman filter over "
+        "bodies from keypoints uses it. Every set of recordings counts alike, except that poses have shares "
+        "as the roots of durations."
     )
     held_out = ""
     if found:
