@@ -7,6 +7,7 @@ and later calls with the same combination go through.
 """
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -98,11 +99,12 @@ class _Check:
     def __init__(self, function: types.FunctionType) -> None:
         self.function = function
         self.signature = inspect.signature(function)
-        self.plain = _PLAIN if _may_have_literals(function) else _PLAIN_AND_WORDS
+        hints = _hints_known_by_now(function)
+        self.plain = _PLAIN if _may_have_literals(hints) else _PLAIN_AND_WORDS
         self.call: Callable | None = None
         self.being_made = False
         self.passed: set[Hashable] = set()
-        source = _wrapper_source(self.signature, function.__annotations__)
+        source = _wrapper_source(self.signature, hints)
         names = {"__check": self, "__passed": self.passed, "__facts_of": self.facts_of}
         names["__types_of"] = _types_of
         exec(_compiled(source), names)
@@ -263,10 +265,19 @@ def _make_check(function: types.FunctionType) -> Callable:
     return jaxtyped(made, typechecker=check_after_call)
 
 
-def _may_have_literals(function: types.FunctionType) -> bool:
+def _hints_known_by_now(function: types.FunctionType) -> dict[str, Any]:
+    """Return the annotations; one that is a string stays so where it names what is defined further down."""
+    hints = dict(function.__annotations__)
+    for name, hint in hints.items():
+        if isinstance(hint, str):
+            with contextlib.suppress(NameError, AttributeError, TypeError):
+                hints[name] = eval(hint, function.__globals__)
+    return hints
+
+
+def _may_have_literals(hints: Mapping[str, Any]) -> bool:
     """Return whether an annotation has a Literal, or is a string that may stand for one."""
-    hints = function.__annotations__.values()
-    return any(isinstance(hint, str) or "Literal" in repr(hint) for hint in hints)
+    return any(isinstance(hint, str) or "Literal" in repr(hint) for hint in hints.values())
 
 
 def _told_by_type(hint: Any) -> bool:

@@ -90,6 +90,10 @@ class Articulation(nn.Module):
     centres: Tensor
     carriers: Tensor
     in_group: Tensor
+    axis_row: Tensor
+    shifted_index: Tensor
+    path_of_shifts: Tensor
+    path_by_group: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -120,6 +124,9 @@ class Articulation(nn.Module):
             "pivot": torch.tensor([_pivot(skeleton, p) for p, _ in axes]),
             "moves": moved[[p for p, _ in axes]].double(),
             "centres": _centre_rotations(skeleton),
+            "axis_row": torch.tensor([3 * p + a for p, a in axes]),
+            "shifted_index": torch.tensor(self.shifted),
+            "path_of_shifts": path[list(self.shifted)].mT[:, None, :, None].double(),
         }
         plan = {**level_plan(skeleton), **self._limb_plan()}
         buffers |= {name: torch.tensor(index, dtype=torch.long) for name, index in plan.items()}
@@ -130,6 +137,8 @@ class Articulation(nn.Module):
         in_group = torch.nn.functional.one_hot(self.group, len(groups)).double()
         in_group[0] = 0
         self.register_buffer("in_group", in_group, persistent=False)
+        by_group = torch.einsum("bn,bg->ngb", self.path, in_group).flatten(0, 1)
+        self.register_buffer("path_by_group", by_group, persistent=False)
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -192,14 +201,14 @@ class Articulation(nn.Module):
 
     def moved(self, point: BodyPoint, step: Float[Tensor, "*batch N"]) -> BodyPoint:
         """Return the point that a step in the tangent space leads to."""
-        at = self.columns
-        turn = self._turns(step[..., at["rotations"]])
+        sizes = [columns.stop - columns.start for columns in self.columns.values()]
+        position, rotations, velocity, scales, shifts = step.split(sizes, -1)
         return BodyPoint(
-            point.position + step[..., at["position"]],
-            point.rotations @ turn,
-            point.velocity + step[..., at["velocity"]],
-            point.scales + step[..., at["scales"]],
-            point.shifts + step[..., at["shifts"]].unflatten(-1, (-1, 3)),
+            point.position + position,
+            point.rotations @ self._turns(rotations),
+            point.velocity + velocity,
+            point.scales + scales,
+            point.shifts + shifts.unflatten(-1, (-1, 3)),
         )
 
     def difference(self, a: BodyPoint, b: BodyPoint) -> Float[Tensor, "*batch N"]:
@@ -235,7 +244,7 @@ class Articulation(nn.Module):
         world = self.centres[:1] @ rotations[:, :1]
         for depth in range(1, len(self.skeleton.part_levels)):
             parts, above = self._level(depth, "parts"), self._level(depth, "above")
-            frames = world.index_select(1, above) @ self.centres[parts]
+            frames = world.index_select(1, above) @ self.centres.index_select(0, parts)
             turns = rotations.index_select(1, parts)
             limbs, places, ends, starts = (
                 self._level(depth, name) for name in ("limbs", "in_level", "ends", "starts")
@@ -244,7 +253,7 @@ class Articulation(nn.Module):
                 bones = joints.index_select(1, ends) - joints.index_select(1, starts)
                 seen = (frames.index_select(1, places).mT @ bones[..., None]).squeeze(-1)
                 swing = quaternion_vector_to_matrix(
-                    minimal_rotation(self.offsets[ends].expand_as(seen), seen)
+                    minimal_rotation(self.offsets.index_select(0, ends).expand_as(seen), seen)
                 )
                 if known is not None:
                     before = turns.index_select(1, places)
@@ -273,16 +282,15 @@ class Articulation(nn.Module):
     def bones(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the bones from each joint's parent to it in the axes of the part that carries it."""
         shifts = point.shifts.new_zeros(*point.shifts.shape[:-2], len(self.offsets), 3)
-        shifts[..., list(self.shifted), :] = point.shifts
-        return self._scaled(point) + shifts
+        return self._scaled(point) + shifts.index_copy(-2, self.shifted_index, point.shifts)
 
     def _scaled(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the bones of a person's lengths, without shifts."""
-        return self.offsets * point.scales[..., self.group].exp()[..., None]
+        return self.offsets * point.scales.index_select(-1, self.group).exp()[..., None]
 
     def joints(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
         """Return the positions of all joints, metres, world axes."""
-        rotations = self.world_rotations(point)[..., self.part_of, :, :]
+        rotations = self.world_rotations(point).index_select(-3, self.part_of)
         bones = (rotations @ self.bones(point)[..., None]).squeeze(-1)
         return point.position[..., None, :] + self.path.mT @ bones
 
@@ -293,19 +301,18 @@ class Articulation(nn.Module):
         (R a) x (p - p_pivot); a bone's scale and shift move its joint and all beyond it.
         """
         rotations = self.world_rotations(point)
-        carried = rotations[..., self.part_of, :, :]
+        carried = rotations.index_select(-3, self.part_of)
         bones = (carried @ self.bones(point)[..., None]).squeeze(-1)
         joints = point.position[..., None, :] + self.path.mT @ bones
-        axes = rotations.mT.flatten(-3, -2)[..., 3 * self.axis_part + self.axis, :]
-        levers = joints[..., None, :, :] - joints[..., self.pivot, None, :]
+        axes = rotations.mT.flatten(-3, -2).index_select(-2, self.axis_row)
+        levers = joints[..., None, :, :] - joints.index_select(-2, self.pivot)[..., None, :]
         turned = torch.linalg.cross(axes[..., None, :].expand_as(levers), levers)
         turned = turned * self.moves[..., None]  # [..., R, J, 3]
         scaled = (carried @ self._scaled(point)[..., None]).squeeze(-1)
-        by_scale = torch.einsum("bn,bg,...bi->...nig", self.path, self.in_group, scaled)
-        shifted = list(self.shifted)
-        by_shift = torch.einsum(
-            "sn,...sij->...nisj", self.path[shifted], carried[..., shifted, :, :]
-        )
+        n_scales = len(self.groups)
+        by_scale = (self.path_by_group @ scaled).unflatten(-2, (-1, n_scales)).mT
+        turned_shifts = carried.index_select(-3, self.shifted_index).transpose(-3, -2)
+        by_shift = self.path_of_shifts * turned_shifts[..., None, :, :, :]
         lead = joints.shape[:-2]
         n = joints.shape[-2]
         eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(*lead, n, 3, 3)

@@ -140,12 +140,12 @@ def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
 
 def exponential(skew: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation matrix exp [v]x of a cross matrix; see `rotvec_to_matrix`."""
-    squared = (skew.square().sum((-2, -1)) / 2)[..., None, None]
+    squared = (skew * skew).sum((-2, -1), keepdim=True) / 2.0
     near_zero = squared < 1e-8  # the next terms of the series are below the rounding of float64
     angle = torch.where(near_zero, 1.0, squared).sqrt()
-    first = torch.where(near_zero, 1 - squared / 6, angle.sin() / angle)
-    half = (angle / 2).sin() / angle
-    second = torch.where(near_zero, 0.5 - squared / 24, 2 * half.square())
+    first = torch.where(near_zero, 1.0 - squared / 6.0, angle.sin() / angle)
+    half = (angle / 2.0).sin() / angle
+    second = torch.where(near_zero, 0.5 - squared / 24.0, 2.0 * half * half)
     eye = torch.eye(3, dtype=skew.dtype, device=skew.device)
     return eye + first * skew + second * (skew @ skew)
 
@@ -171,7 +171,7 @@ def vector_to_quaternion(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
     there and has no slope.
     """
     vector = within_unit_ball(vector)
-    squared = 1 - _squared_length(vector)
+    squared = 1.0 - _squared_length(vector)
     on_sphere = squared <= 2 * torch.finfo(vector.dtype).eps
     w = torch.where(on_sphere, torch.ones_like(squared), squared).sqrt()
     return torch.cat([vector, torch.where(on_sphere, torch.zeros_like(w), w)], -1)
@@ -186,7 +186,7 @@ def _squared_length(vector: Tensor) -> Tensor:
 def quaternion_to_vector(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
     """Return the vector part of q or of -q, whichever has w >= 0; q and -q are the same rotation."""
     vector, w = quaternion[..., :3], quaternion[..., 3:]
-    return torch.where(w < 0, -vector, vector)
+    return torch.where(w < 0.0, -vector, vector)
 
 
 def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -206,13 +206,13 @@ def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tens
     """
     check_shape("vector", vector, ["...", 3])
     x, y, z, w = vector_to_quaternion(vector).unbind(-1)
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
-    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    xx, yy, zz = 2.0 * x * x, 2.0 * y * y, 2.0 * z * z
+    xy, xz, yz = 2.0 * x * y, 2.0 * x * z, 2.0 * y * z
+    wx, wy, wz = 2.0 * w * x, 2.0 * w * y, 2.0 * w * z
     rows = [
-        1 - yy - zz, xy - wz, xz + wy,
-        xy + wz, 1 - xx - zz, yz - wx,
-        xz - wy, yz + wx, 1 - xx - yy,
+        1.0 - yy - zz, xy - wz, xz + wy,
+        xy + wz, 1.0 - xx - zz, yz - wx,
+        xz - wy, yz + wx, 1.0 - xx - yy,
     ]  # fmt: skip
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
@@ -232,10 +232,10 @@ def matrix_to_quaternion_vector(
     a, b, c, d, e, f, g, h, i = rotation.flatten(-2).unbind(-1)
     xy, xz, yz, wx, wy, wz = b + d, c + g, f + h, h - f, c - g, d - b
     rows = [
-        1 + a - e - i, xy, xz, wx,
-        xy, 1 - a + e - i, yz, wy,
-        xz, yz, 1 - a - e + i, wz,
-        wx, wy, wz, 1 + a + e + i,
+        1.0 + a - e - i, xy, xz, wx,
+        xy, 1.0 - a + e - i, yz, wy,
+        xz, yz, 1.0 - a - e + i, wz,
+        wx, wy, wz, 1.0 + a + e + i,
     ]  # fmt: skip
     outer = torch.stack(rows, -1).unflatten(-1, (4, 4))
     best = outer.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
@@ -247,7 +247,7 @@ def matrix_to_rotvec(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*b
     """Return the Rodrigues vector of a rotation matrix, radians; the inverse of `rotvec_to_matrix`."""
     quaternion = matrix_to_quaternion_vector(rotation)
     length = quaternion.norm(dim=-1, keepdim=True).clamp(1e-12, 1.0)
-    return 2 * quaternion * (length.asin() / length)
+    return 2.0 * quaternion * (length.asin() / length)
 
 
 def conjugate(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -312,7 +312,7 @@ def minimal_rotation(
     b = torch.nn.functional.normalize(end, dim=-1)
     a, b = torch.broadcast_tensors(a, b)
     middle = a + b
-    opposite = middle.square().sum(-1, keepdim=True) <= 16 * torch.finfo(a.dtype).eps ** 2
+    opposite = (middle * middle).sum(-1, keepdim=True) <= 16 * torch.finfo(a.dtype).eps ** 2
     middle = torch.where(opposite, _across(a), middle)
     return torch.linalg.cross(a, torch.nn.functional.normalize(middle, dim=-1))
 

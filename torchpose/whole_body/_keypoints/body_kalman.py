@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.module_state import derived
+from torchpose._core.module_state import derived, index_tensor
 from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
@@ -82,7 +82,7 @@ _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which si
 _SCALE_TIME = 2.0  # seconds over which the factors of the cameras' noise are averaged
 _WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of the noise that are tried for cameras with few inliers
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
-_HIPS = [BODY_15.joint(name) for name in ("pelvis", "left_hip", "right_hip")]
+_HIPS = tuple(BODY_15.joint(name) for name in ("pelvis", "left_hip", "right_hip"))
 
 
 class BodyGaussian(NamedTuple):
@@ -264,7 +264,7 @@ class BodyKalmanFilter(nn.Module):
         gap, variance, H = expected
         HP = H @ state.cov
         spread = HP @ H.mT + torch.diag_embed(variance / share)
-        chol = torch.linalg.cholesky((spread + spread.mT) / 2)
+        chol = torch.linalg.cholesky((spread + spread.mT) / 2.0)
         U = torch.linalg.solve_triangular(chol, HP, upper=False)
         step = (HP.mT @ torch.cholesky_solve(gap[..., None], chol)).squeeze(-1)
         mean = self.articulation.moved(state.mean, step)
@@ -299,8 +299,9 @@ class BodyKalmanFilter(nn.Module):
         Such a pelvis has to go along with the trunk. It would lag behind who walks, since its own speed is
         expected to decay, and the trunk would lean over more and more.
         """
-        seen = (frame.inlier > 0).any(1)
-        rows = seen.any(-1) & ~seen[:, _HIPS].any(-1) & (len(self.maps.shift) > 1)
+        seen = (frame.inlier > 0.0).any(1)
+        hips = index_tensor(_HIPS, seen.device)
+        rows = seen.any(-1) & ~seen.index_select(-1, hips).any(-1) & (len(self.maps.shift) > 1)
         return rows.nonzero().squeeze(-1)
 
     def _held(self, state: BodyGaussian) -> BodyGaussian:
@@ -447,7 +448,7 @@ class BodyKalmanFilter(nn.Module):
         scale, told = self._next_scale(state, readings, seen, weighed, joint_cov)
         after = BodyGaussian(
             a.swung(point, joints),
-            (cov + cov.mT) / 2,
+            (cov + cov.mT) / 2.0,
             torch.logit(weighed.exchanged, _ODDS),
             scale,
             state.doubt,
@@ -479,10 +480,10 @@ class BodyKalmanFilter(nn.Module):
                     torch.where(few, wide, own)
                     for wide, own in zip(wider, (sums, count), strict=True)
                 )
-        tells = (count / _SCALE_COUNT).clamp_max(1)
+        tells = (count / _SCALE_COUNT).clamp_max(1.0)
         told = (state.told + tells).clamp_max(_SCALE_TIME * self.fps)
         ratio = sums / count.clamp_min(1e-6)
-        scale = state.scale * (1 + tells / told * (ratio - 1))
+        scale = state.scale * (1.0 + tells / told * (ratio - 1.0))
         return scale.clamp(*NOISE_SCALES), told
 
     def _by_wider(
@@ -536,7 +537,7 @@ class BodyKalmanFilter(nn.Module):
 
         That counts for joints that several cameras see, of which the prediction accepts one at most.
         """
-        there, accepted = readings.inlier[0] > 0, found.weighed.inlier > 0.5
+        there, accepted = readings.inlier[0] > 0.0, found.weighed.inlier > 0.5
         unsure = (there.sum(-2) > 1) & (accepted.sum(-2) < 2)
         if not bool(unsure.any()):
             return elsewhere

@@ -71,7 +71,7 @@ def _by_blocks(
 
 def plus_one(matrix: Tensor) -> Tensor:
     """Return the symmetric part of a matrix plus the unit matrix."""
-    return (matrix + matrix.mT) / 2 + unit(matrix.shape[-1], matrix)
+    return (matrix + matrix.mT) / 2.0 + unit(matrix.shape[-1], matrix)
 
 
 def unit(size: int, like: Tensor) -> Tensor:

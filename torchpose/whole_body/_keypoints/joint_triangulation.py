@@ -29,15 +29,18 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
         maps: the cameras. frame: the keypoints.
     """
     normal, right = _normal_equations(maps, frame)
-    there = frame.inlier > 0
+    there = frame.inlier > 0.0
     best = torch.full_like(frame.variance[:, 0], -1.0)
     chosen = torch.zeros_like(there)
     for a, b in combinations(range(len(maps.shift)), 2):
         both = (there[:, a] & there[:, b])[..., None]
         pair = normal[:, a] + normal[:, b], right[:, a] + right[:, b]
         seen = see(maps, _solved(both[..., None] * pair[0], both * pair[1]))
-        variance = frame.variance + frame.relative * seen.by_joint.square().sum((-2, -1)) / 2
-        error = (seen.pixels - frame.pixels).square().sum(-1) / variance
+        variance = (
+            frame.variance + frame.relative * (seen.by_joint * seen.by_joint).sum((-2, -1)) / 2.0
+        )
+        off = seen.pixels - frame.pixels
+        error = (off * off).sum(-1) / variance
         agree = there & seen.in_front & (error < _AGREE**2)
         score = (
             agree.to(error) - torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
@@ -68,7 +71,7 @@ def agreement_of_each(
     """Return the sums of `agreement` of each element of the batch, and the numbers of its keypoints."""
     chosen, there = agreeing(maps, frame), frame.inlier > 0
     seen = see(maps, triangulate_all(maps, frame, chosen))
-    variance = frame.variance + frame.relative * seen.by_joint.square().sum((-2, -1)) / 2
+    variance = frame.variance + frame.relative * (seen.by_joint * seen.by_joint).sum((-2, -1)) / 2.0
     error = (seen.pixels - frame.pixels).square().sum(-1) / variance
     good = torch.where(chosen, (1 - error / _AGREE**2).clamp_min(0), 0.0)
     both = there & (there.sum(1, keepdim=True) >= 2)
@@ -94,7 +97,7 @@ def _normal_equations(
     """Return what each camera adds to the normal equations of the joints."""
     rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
     right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
-    size = maps.matrix[:, 2].norm(dim=-1)[:, None, None]
+    size = torch.linalg.vector_norm(maps.matrix[:, 2], dim=-1)[:, None, None]
     rows, right = rows / size[..., None], right / size
     return rows.mT @ rows, (rows.mT @ right[..., None]).squeeze(-1)
 
@@ -103,4 +106,6 @@ def _solved(
     normal: Float[Tensor, "B J 3 3"], right: Float[Tensor, "B J 3"]
 ) -> Float[Tensor, "B J 3"]:
     """Return the joints of least squares."""
-    return torch.linalg.solve(normal + 1e-9 * torch.eye(3).to(normal), right)
+    return torch.linalg.solve(
+        normal + 1e-9 * torch.eye(3, dtype=normal.dtype, device=normal.device), right
+    )

@@ -156,7 +156,7 @@ def with_sides_exchanged(
         frame: the keypoints. exchanged: of which cameras and groups of joints. exchange: the groups.
     """
     groups, mirror = exchange.groups, exchange.mirror
-    chosen = exchanged.to(groups) @ groups > 0
+    chosen = exchanged.to(groups) @ groups > 0.0
 
     def sided(value: Tensor) -> Tensor:
         rows = chosen[..., None] if value.ndim > chosen.ndim else chosen
@@ -202,10 +202,10 @@ def weigh(
         decide: whether keypoints tell about exchanged sides; else the prior alone does.
         width: factor of the noise's variance.
     """
-    size = 0.5 * seen.by_joint.square().sum((-2, -1))  # about f^2 / depth^2
+    size = 0.5 * (seen.by_joint * seen.by_joint).sum((-2, -1))  # about f^2 / depth^2
     scale = (width * beliefs.scale)[..., None]
     variance = scale * (readings.variance + readings.relative * size)
-    inlier, there = readings.inlier, readings.inlier > 0
+    inlier, there = readings.inlier, readings.inlier > 0.0
     present = there & seen.in_front
     off = readings.pixels - seen.pixels
     density = _log_density(off, seen.by_joint, joint_cov, variance, marginal)
@@ -221,7 +221,7 @@ def weigh(
     logsigmoid = torch.nn.functional.logsigmoid
     mixed = torch.logaddexp(logsigmoid(-log_odds), logsigmoid(log_odds) + gain)
     return Weighed(
-        own * (1 - swapped),
+        own * (1.0 - swapped),
         other * swapped,
         variance[0],
         variance[1],
@@ -236,7 +236,7 @@ def _log_density(
 ) -> Tensor:
     """Return log N(r; 0, A P A^T + R), or log N(r; 0, R) expected over A P A^T; R = variance I."""
     if joint_cov is None or not marginal:
-        square = residual.square().sum(-1)
+        square = (residual * residual).sum(-1)
         if joint_cov is not None:
             square = square + _mean_square(by_joint, joint_cov)
         return -0.5 * square / variance - (2 * math.pi * variance).log()
@@ -244,7 +244,7 @@ def _log_density(
     a, b, d = spread[..., 0, 0] + variance, spread[..., 0, 1], spread[..., 1, 1] + variance
     det = a * d - b * b
     x, y = residual.unbind(-1)
-    square = (d * x * x - 2 * b * x * y + a * y * y) / det
+    square = (d * x * x - 2.0 * b * x * y + a * y * y) / det
     return -0.5 * square - 0.5 * det.log() - math.log(2 * math.pi)
 
 
@@ -268,8 +268,9 @@ def squared_errors(
     Only keypoints read as of their own joint count, by their weights: E[|r|^2] = |r|^2 + tr A P A^T.
     """
     spread = _mean_square(seen.by_joint, joint_cov)
-    square = (readings.pixels[0] - seen.pixels).square().sum(-1) + spread
-    return (weighed.own * square / weighed.variance).sum(-1), 2 * weighed.own.sum(-1)
+    off = readings.pixels[0] - seen.pixels
+    square = (off * off).sum(-1) + spread
+    return (weighed.own * square / weighed.variance).sum(-1), 2.0 * weighed.own.sum(-1)
 
 
 def _mean_square(

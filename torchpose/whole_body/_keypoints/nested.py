@@ -25,7 +25,9 @@ def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
 
 def taken(value: Any, index: Tensor | int) -> Any:
     """Return some elements of the batch, or one of them, of a tensor or of named tuples of tensors."""
-    return mapped(lambda tensor: tensor[index], value)
+    if isinstance(index, int):
+        return mapped(lambda tensor: tensor[index], value)
+    return mapped(lambda tensor: tensor.index_select(0, index), value)
 
 
 def frame_at(value: Any, time: int) -> Any:
