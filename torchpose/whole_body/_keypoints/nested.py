@@ -30,6 +30,11 @@ def taken(value: Any, index: Tensor | int) -> Any:
     return mapped(lambda tensor: tensor.index_select(0, index), value)
 
 
+def one_of(value: Any, row: int) -> Any:
+    """Return one element of the batch as a batch of one, of a tensor or of named tuples of tensors."""
+    return mapped(lambda tensor: tensor.narrow(0, row, 1), value)
+
+
 def frame_at(value: Any, time: int) -> Any:
     """Return one frame [B, ...] of a tensor [B, T, ...], or of named tuples of tensors."""
     return mapped(lambda tensor: tensor[:, time], value)

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -27,7 +27,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import notes_on_strays
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import to_be_smoothed
-from torchpose.whole_body._keypoints.nested import FrameCollector, stacked, taken
+from torchpose.whole_body._keypoints.nested import FrameCollector, one_of, stacked, taken
 from torchpose.whole_body._keypoints.people_association import (
     pairs_of_detections,
     taken_detections,
@@ -142,7 +142,7 @@ class PeopleBodyTracker:
         state, feet = self._feet_of_all(stream, found, seen)
         tracks = []
         for row in (found.identity > 0).nonzero().flatten().tolist():
-            own = None if feet is None else with_time(taken(feet, torch.tensor([row])))
+            own = None if feet is None else with_time(one_of(feet, row))
             who = int(found.identity[row])
             tracks.append(self._track_of([_Row(0, row, found)], who, own, summed_up=False))
         return LivePeople(after, state, found.number), tracks
@@ -181,7 +181,7 @@ class PeopleBodyTracker:
     def _check_cameras(self, rows: Sequence[_Row]) -> None:
         """Raise `CameraError` for cameras of another convention or unit, by the keypoints of all persons."""
         if rows:
-            seen = [taken(one.frame.keypoints, torch.tensor([one.row])) for one in rows]
+            seen = [one_of(one.frame.keypoints, one.row) for one in rows]
             self.single.check_cameras(stacked(seen))
 
     def _check_cameras_of_pairs(self, frames: KeypointFrame) -> None:
@@ -219,8 +219,9 @@ class PeopleBodyTracker:
         """Return the track of one person with the feet, of detections [T, D, C, 6]."""
         every = FrameCollector(len(rows))
         for row in rows:
-            one, pose = torch.tensor([row.row]), row.frame.poses
-            every.add(taken(to_be_smoothed(pose, row.frame.corrected) if smoothing else pose, one))
+            pose: Any = row.frame.poses
+            pose = to_be_smoothed(pose, row.frame.corrected) if smoothing else pose
+            every.add(one_of(pose, row.row))
         poses = self.single.tracker.smoothed(*every.sequence) if smoothing else every.sequence
         standing = None
         if feet is not None:
@@ -240,14 +241,15 @@ class PeopleBodyTracker:
         summed_up: bool = True,
     ) -> BodyTrack:
         """Return the track of one person; by default of the poses as they were filtered."""
-        found = [(row.frame, torch.tensor([row.row])) for row in rows]
         if poses is None:
-            poses = stacked([taken(frame.poses, one) for frame, one in found])
-        keypoints: KeypointFrame = stacked([taken(frame.keypoints, one) for frame, one in found])
+            poses = stacked([one_of(row.frame.poses, row.row) for row in rows])
+        keypoints: KeypointFrame = stacked([one_of(row.frame.keypoints, row.row) for row in rows])
         track = self.single.builder.track(
             poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet
         )
-        track.details["detection"] = torch.cat([frame.detection[one] for frame, one in found])
+        track.details["detection"] = torch.cat(
+            [one_of(row.frame.detection, row.row) for row in rows]
+        )
         track.details["person"] = track.details["detection"].new_full((len(rows),), person)
         return track
 
