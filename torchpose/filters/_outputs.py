@@ -68,7 +68,7 @@ class FilterOutput(NamedTuple):
 
 def effective_sample_size(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch"]:
     """Return N_eff = 1 / sum_j w_j^2 of normalised log-weights (BL 25)."""
-    return torch.exp(-torch.logsumexp(2 * log_weights, -1))
+    return torch.exp(-torch.logsumexp(2.0 * log_weights, -1))
 
 
 class Mending(NamedTuple):

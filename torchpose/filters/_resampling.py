@@ -265,18 +265,18 @@ def _solve(relative: Tensor, alive: Tensor, start: Tensor, target: float) -> Ten
     for _ in range(_MOST_STEPS):
         beta = u.exp()
         scaled = torch.where(alive, beta[..., None] * relative, -torch.inf)
-        once, twice = torch.logsumexp(scaled, -1), torch.logsumexp(2 * scaled, -1)
-        value = 2 * once - twice - target
+        once, twice = torch.logsumexp(scaled, -1), torch.logsumexp(2.0 * scaled, -1)
+        value = 2.0 * once - twice - target
         done = value.abs() < _TOLERANCE
         if bool(done.all()):
             break
         low, high = torch.where(value > 0, u, low), torch.where(value > 0, high, u)
-        gap = (scaled - once[..., None]).exp() - (2 * scaled - twice[..., None]).exp()
-        slope = 2 * beta * (gap * relative).sum(-1)
+        gap = (scaled - once[..., None]).exp() - (2.0 * scaled - twice[..., None]).exp()
+        slope = 2.0 * beta * (gap * relative).sum(-1)
         newton = u - value / slope
         inside = (newton > low) & (newton < high)
         # what is found stays: it must not depend on how long others in the batch take
-        u = torch.where(done, u, torch.where(inside, newton, (low + high) / 2))
+        u = torch.where(done, u, torch.where(inside, newton, (low + high) / 2.0))
     return u
 
 

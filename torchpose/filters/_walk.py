@@ -182,7 +182,7 @@ class MixtureWalk:
         return mean, self.scale @ cov @ self.scale.mT
 
     def _shrink(self, inflation: float) -> Float[Tensor, "K D"]:
-        return (1 / (1 + inflation * self.ratio)).to(self.rows.dtype)
+        return (1 / (1.0 + inflation * self.ratio)).to(self.rows.dtype)
 
     def _log_norm(self, inflation: float) -> Float[Tensor, " K"]:
         return self.log_norm - 0.5 * torch.log1p(inflation * self.ratio).sum(-1)

@@ -104,7 +104,7 @@ def k_means(
     for _ in range(steps):
         counts = torch.zeros_like(centres[:, 0]).index_add_(0, labels, shares)
         sums = torch.zeros_like(centres).index_add_(0, labels, x * shares.unsqueeze(-1))
-        occupied = counts > 0
+        occupied = counts > 0.0
         centres = torch.where(
             occupied.unsqueeze(-1), sums / counts.where(occupied, 1.0).unsqueeze(-1), centres
         )

@@ -282,7 +282,7 @@ def _collapsed(count: Tensor, spread: Tensor, floor: Tensor) -> Tensor:
     least = min(dim + 1.0, float(count.sum()) / (10 * n_components))
     usable = torch.isfinite(spread).all(-1).all(-1)
     excess = torch.where(usable[:, None, None], symmetrise(spread - floor), -floor)
-    flat = (excess.diagonal(dim1=-2, dim2=-1) <= 0).all(-1)
+    flat = (excess.diagonal(dim1=-2, dim2=-1) <= 0.0).all(-1)
     if bool(flat.any()):  # the diagonal alone decides nearly always
         flat &= torch.linalg.eigvalsh(excess)[:, -1] <= 0
     singular = torch.linalg.cholesky_ex(torch.where(usable[:, None, None], spread, 0) + floor).info

@@ -232,7 +232,7 @@ def right_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
 
 def _sign(values: Tensor) -> Tensor:
     """Return -1 below zero and 1 elsewhere."""
-    return torch.where(values < 0, -1.0, 1.0).to(values.dtype)
+    return torch.where(values < 0.0, -1.0, 1.0).to(values.dtype)
 
 
 def _product_matrix(quaternion: Tensor, layout: tuple[tuple[int, ...], ...]) -> Tensor:

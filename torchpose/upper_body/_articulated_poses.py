@@ -135,7 +135,7 @@ def pose_of(
         square = moved[..., :, None] * moved[..., None, :]
         covs = mean_covs.index_add(1, rows, trust * square)
         posterior = joints.index_add(1, rows, moved), mean_covs
-    area = 2 * (shoulders[..., 2].mean(1).log() - log_focal)
+    area = 2.0 * (shoulders[..., 2].mean(1).log() - log_focal)
     evidence = belief.log_evidence + body.limbs.sum(-1) * area[:, None]
     evidence = torch.where(body.limbs.any(-1), evidence, 0.0)
     log_weights = belief.weight.clamp_min(1e-30).log()

@@ -263,7 +263,7 @@ class BodyLengths:
         precision = lengths.precision + bend
         mean = lengths.mean + (slope / precision).clamp(-_MOST, _MOST)
         mean = mean - mean[:, [self.surest]]
-        limit = 3 * self.spread
+        limit = 3.0 * self.spread
         return Lengths(mean.clamp(-limit, limit), precision)
 
     def _slopes_of_arms(
@@ -284,7 +284,7 @@ class BodyLengths:
         size = self.metres(lengths) * root.size
         inward, wavering = (x[:, None] for x in inward_shares(torso, root.depth[:, 0]))
         width, height = size[:, 2:3], size[:, 3:]
-        across = width * (1 - inward) * root.turn.cos()
+        across = width * (1.0 - inward) * root.turn.cos()
         free = _WIDTH_STD**2 + (width * wavering).square()
         pairs = ((0, 1, 0, across, free), (2, 3, 1, height, _HEIGHT_STD**2))
         found = []

@@ -163,6 +163,6 @@ def _form(
     first, second = torch.tril_indices(n_axes + 1, n_axes + 1, device=upper.device)
     slopes = []
     for i, j in zip(first.tolist(), second.tolist(), strict=True):
-        of_axes = lower if i == j else 2 * lower  # either order of two axes counts
+        of_axes = lower if i == j else 2.0 * lower  # either order of two axes counts
         slopes.append(upper if i == 0 else across if j == 0 else of_axes)
     return first, second, torch.stack(slopes)

@@ -36,8 +36,8 @@ def seen_lean(
     """
     apart = (rays[:, _LEFT] - rays[:, _RIGHT]) * depth[:, None]
     dx, dy = apart[:, 0], apart[:, 1]
-    seen = torch.stack([dx.square() - dy.square() + _SHORT**2, 2 * dx * dy], 1)
-    share = torch.where((moments == 0).all(1), 1.0, 1 - math.exp(-1 / (_MEMORY * fps)))
+    seen = torch.stack([dx.square() - dy.square() + _SHORT**2, 2.0 * dx * dy], 1)
+    share = torch.where((moments == 0.0).all(1), 1.0, 1 - math.exp(-1 / (_MEMORY * fps)))
     both = (known[:, _LEFT] & known[:, _RIGHT])[:, None]
     return torch.where(both, moments + share[:, None] * (seen - moments), moments)
 
@@ -50,9 +50,9 @@ def lean_angle(moments: Float[Tensor, "B 2"]) -> Float[Tensor, " B"]:
     Args:
         moments: the moments m of `seen_lean`.
     """
-    seen = (moments != 0).any(1)
+    seen = (moments != 0.0).any(1)
     first = torch.where(seen, moments[:, 0], torch.ones_like(moments[:, 0]))
-    angle = torch.atan2(moments[:, 1], first) / 2
+    angle = torch.atan2(moments[:, 1], first) / 2.0
     return angle**3 / (angle.square() + _LEVEL**2)
 
 

@@ -266,7 +266,7 @@ def _averaged(share: Float[Tensor, "B T"], ours: SeenPoses, theirs: SeenPoses) -
     weight = share[..., None, None]
     joints, covs = _moments(weight, *((poses.joints, poses.covs) for poses in both))
     uv, uv_covs = _moments(weight, *((poses.uv, poses.uv_covs) for poses in both))
-    shares = torch.stack([share, 1 - share], -1)
+    shares = torch.stack([share, 1.0 - share], -1)
     return SeenPoses(joints, covs, rotations, shares, place, uv, uv_covs)
 
 

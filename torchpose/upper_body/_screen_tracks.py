@@ -80,7 +80,7 @@ def take_over(
     other joints needs more of it, and may need more than there can be.
     """
     (track, candidate), (of_track, of_candidate) = odds.unbind(1), state.evidence.unbind(1)
-    candidate = candidate.masked_fill(of_candidate <= 0, -math.inf)
+    candidate = candidate.masked_fill(of_candidate <= 0.0, -math.inf)
     total = track + body
     right, beside = total > 0, candidate > 0
     change = torch.where(right, -TAKEOVER, torch.where(beside, model.dt, -model.dt))
@@ -105,7 +105,7 @@ def update_tracks(
     gains = state.cov[..., :2] / total[..., None]
     gain, turn = gains.unbind(-1)
     apart = z[:, None] - state.position
-    change = weight * ((1 - weight) * apart.square().sum(-1) / 2 - total)
+    change = weight * ((1 - weight) * apart.square().sum(-1) / 2.0 - total)
     squares = torch.stack([gain.square(), gain * turn, turn.square()], -1)
     forward, faster = (weight[..., None] * gains).chunk(2, -1)
     return state._replace(

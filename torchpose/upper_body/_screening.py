@@ -162,7 +162,7 @@ def _step(
     wrong = probability < 0.5
     nowhere = wrong & (body < -DOUBTFUL)[:, None]
     state = update_tracks(state, z, noise, probability.masked_fill(nowhere, 0.0))
-    new = known & wrong.all(1) & (state.evidence[:, 1] <= 0)
+    new = known & wrong.all(1) & (state.evidence[:, 1] <= 0.0)
     if bool(new.any()):
         state = start_candidates(model, state, z, noise, square[:, 0], new)
     return state, probability[:, 0], way
@@ -194,7 +194,7 @@ def _log_odds(
     usual, brisk = densities.unbind(-1)
     either, known = torch.logaddexp(usual, brisk), known[:, None]
     total = either if doubt is None else either - doubt[:, None]
-    return _Odds(total * known, (brisk - either).exp() * (known & (total > 0)))
+    return _Odds(total * known, (brisk - either).exp() * (known & (total > 0.0)))
 
 
 def _exchange(
@@ -207,8 +207,8 @@ def _exchange(
     none may begin, as in most frames, the way is None.
     """
     ways, track = model.exchanges, odds.total[:, 0]
-    ill = model.exchanged & ((track <= 0) | (odds.brisk[:, 0] >= 0.5))
-    begun = state.lasting > 0
+    ill = model.exchanged & ((track <= 0.0) | (odds.brisk[:, 0] >= 0.5))
+    begun = state.lasting > 0.0
     barred = (ill.any(-1) | ~apart[:, None]) & ~begun[:, None] & model.exchanged.any(1)
     if bool(barred[:, 1:].all()):
         state = state._replace(exchange=not_exchanged(model, len(track)))
@@ -261,8 +261,10 @@ def _beside_others(
     sums = model.subsets @ torch.cat([precision, pulled, pulled * apart], -1)  # [B, G, S, 5]
     total, pull, square = sums.split([1, 2, 2], -1)
     misfit = (square - pull.square() / total.clamp_min(1e-12)).sum(-1)
-    count = (linear(known.to(z), model.subsets) - 1).clamp_min(0.0)
-    weights = linear(odds, model.subsets)[:, None] - 2 * count[:, None] * model.log_scales[:, None]
+    count = (linear(known.to(z), model.subsets) - 1.0).clamp_min(0.0)
+    weights = (
+        linear(odds, model.subsets)[:, None] - 2.0 * count[:, None] * model.log_scales[:, None]
+    )
     weights = (scales[..., None] + weights).sub(misfit, alpha=0.5)
     of_scales = weights.logsumexp(-1, keepdim=True)
     share = (weights - of_scales.amax(1, keepdim=True)).exp().sum(1)
@@ -285,7 +287,7 @@ def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"] | None:
 
 def _noisier(measured: MeasuredJoints, factor: Float[Tensor, "B T"]) -> MeasuredJoints:
     """Return measurements with R times its factor, and so less sure; the same value if it is 1 everywhere."""
-    if bool((factor == 1).all()):
+    if bool((factor == 1.0).all()):
         return measured
     factor = factor.to(measured.cov)[..., None]
     of_joints = factor[..., None, None]

@@ -51,7 +51,7 @@ def follow_size(
         size: the sizes after the frame before. torso: the measured joints, upright. seconds: between both.
     """
     left, right, _, head = torso.rays[..., :2].unbind(1)
-    lengths = torch.stack([(left + right)[:, 1] / 2 - head[:, 1], (left - right)[:, 0].abs()], 1)
+    lengths = torch.stack([(left + right)[:, 1] / 2.0 - head[:, 1], (left - right)[:, 0].abs()], 1)
     both = torso.known[:, :2].all(1)
     known = torch.stack([both & torso.known[:, 3], both], 1)
     logs = lengths.clamp_min(_LEAST).log()

@@ -64,7 +64,7 @@ class TorsoLengths(NamedTuple):
         """
         up = torch.stack([torch.full_like(height, -neck), -neck - height], 1)
         level, zero = torch.zeros_like(up), torch.zeros_like(height)
-        across = width_std / 2
+        across = width_std / 2.0
         spread = torch.stack([across, zero, across, zero, zero, zero, zero, height_std], -1)
         stiffness = spread.square().unflatten(-1, (4, 2)) + _stiff(height.dtype, height.device)
         return cls(width, torch.stack([level, up, level], -1), stiffness)
@@ -115,7 +115,7 @@ def half_widths(
     width: Float[Tensor, " B"], raised: Float[Tensor, "B *grid 2"]
 ) -> Float[Tensor, "B *grid 2"]:
     """Return the distances of both shoulders from their middle, metres: less where an arm is raised."""
-    return with_axes(width, raised.ndim - 1) / 2 * (1 - _INWARD * raised)
+    return with_axes(width, raised.ndim - 1) / 2.0 * (1.0 - _INWARD * raised)
 
 
 def inward_shares(torso: Torso, depth: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
@@ -165,10 +165,10 @@ def torso_log_likelihood(
     count = with_axes(torso.known.sum(-1).to(depth), depth.ndim - 1)
     value, precision, mean = _middles(torso, depth, turn, lengths)
     off = (precision * (value - mean[..., None, :]).square()).sum(-2)
-    logs = torch.where(precision > 0, precision, 1.0).log().sum(-2)
-    mass = torch.where(count[..., None] > 0, precision.sum(-2), 1.0)
+    logs = torch.where(precision > 0.0, precision, 1.0).log().sum(-2)
+    mass = torch.where(count[..., None] > 0.0, precision.sum(-2), 1.0)
     both = heavy_tail(off) + 0.5 * (logs - mass.log())
-    return both.sum(-1) + 2 * (count - 1).clamp_min(0) * depth.log()
+    return both.sum(-1) + 2.0 * (count - 1.0).clamp_min(0) * depth.log()
 
 
 class _Middle(NamedTuple):

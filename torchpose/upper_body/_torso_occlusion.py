@@ -34,7 +34,7 @@ def log_in_view(
         ends: places of elbows or hands, upright axes of the torso, from the camera, metres.
         shoulder, middle: of the same arm, and the middle of both, in the same axes.
     """
-    width = 2 * torch.linalg.vector_norm(shoulder - middle, dim=-1)[..., None]
+    width = 2.0 * torch.linalg.vector_norm(shoulder - middle, dim=-1)[..., None]
     width = width.clamp_min(_NARROWEST)
     x, down, z = ((ends - middle[..., None, :]) / width[..., None]).unbind(-1)
     x, z = x / _WIDE, z / _DEEP
@@ -42,11 +42,11 @@ def log_in_view(
     far = torch.hypot(*to_camera)
     side, front = (value / far for value in to_camera)
     along, beside = x * side + z * front, (x * front - z * side).square()
-    surface = (1 - beside).clamp_min(1e-12).sqrt()
+    surface = (1.0 - beside).clamp_min(1e-12).sqrt()
     inside = torch.sigmoid((surface - along.abs()) / _SOFT)
     behind = torch.sigmoid((surface - along) / _SOFT)
     hidden = inside.lerp(behind, torch.sigmoid(front / -_FACING))
     at_height = torch.sigmoid((down - _TOP) / _SOFT_TOP) * torch.sigmoid(
         (_BOTTOM - down) / _SOFT_BOTTOM
     )
-    return torch.log1p((_HIDDEN - 1) * hidden * at_height * (beside < 1))
+    return torch.log1p((_HIDDEN - 1) * hidden * at_height * (beside < 1.0))

@@ -171,7 +171,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         step = step * self.step_std
         var_step, var_pose = self._variances(particles)
         gain = var_step / (var_step + var_pose)
-        product = gain * ahead + (1 - gain).sqrt() * step[..., self.columns]
+        product = gain * ahead + (1.0 - gain).sqrt() * step[..., self.columns]
         step[..., self.columns] = torch.where(
             exact[:, None, None], product, step[..., self.columns]
         )

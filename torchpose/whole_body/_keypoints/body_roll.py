@@ -77,7 +77,7 @@ def _away(limbs: Float[Tensor, "B 2 2"], up: Float[Tensor, "B 2"]) -> Bool[Tenso
     """Return where trunk and legs both point far from a direction, and not against each other."""
     along, length = (limbs * up[:, None]).sum(-1), limbs.norm(dim=-1)
     far = ((along < _LIMIT * length) & (length > _CLEAR)).all(-1)
-    return far & (limbs.prod(1).sum(-1) > 0)
+    return far & (limbs.prod(1).sum(-1) > 0.0)
 
 
 def _limbs(rays: Float[Tensor, "B J 2"], there: Bool[Tensor, "B J"]) -> Float[Tensor, "B 2 2"]:
@@ -93,6 +93,6 @@ def _averaged(
     before: Float[Tensor, "B 2 2"], now: Float[Tensor, "B 2 2"], share: float
 ) -> Float[Tensor, "B 2 2"]:
     """Return averages with the values of a frame; the first one counts for all before."""
-    first = (before == 0).all(-1, keepdim=True)
+    first = (before == 0.0).all(-1, keepdim=True)
     mean = torch.where(first, now, torch.lerp(before, now, share))
     return torch.where(now.isfinite(), mean, before)

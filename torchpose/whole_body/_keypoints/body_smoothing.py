@@ -75,7 +75,7 @@ def _smoothed(
         off = body.difference(found[-1].mean, expected)
         step = (gains[:, t] @ off[..., None]).squeeze(-1)
         change = gains[:, t] @ (found[-1].cov - predicted[:, t]) @ gains[:, t].mT
-        found.append(BodyMoments(body.moved(mean, step), cov + (change + change.mT) / 2))
+        found.append(BodyMoments(body.moved(mean, step), cov + (change + change.mT) / 2.0))
     smoothed: BodyMoments = stacked(found[:0:-1])
     return smoothed
 

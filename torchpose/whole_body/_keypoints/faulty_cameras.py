@@ -111,8 +111,8 @@ def any_wrong(off: Bool[Tensor, "B C"], turn: Float[Tensor, "B C 3 3"]) -> Bool[
 
 def noted(faults: CameraFaults, frame: KeypointFrame, used: KeypointFrame) -> CameraFaults:
     """Return the faults with a frame kept for the next one, and of `without_still` what of it is used."""
-    there, use = ((one.inlier > 0).any(-1) for one in (frame, used))
-    still = torch.where(there & ~use, faults.still + 1, 0.0)
+    there, use = ((one.inlier > 0.0).any(-1) for one in (frame, used))
+    still = torch.where(there & ~use, faults.still + 1.0, 0.0)
     return faults._replace(pixels=frame.pixels, inlier=frame.inlier, still=still)
 
 
@@ -238,7 +238,7 @@ def looked_at_again(
     Args:
         filter: that tracks. faults: that are known. frame: the keypoints.
     """
-    if not bool((faults.looks.n_frames > 0).any()):
+    if not bool((faults.looks.n_frames > 0.0).any()):
         return faults
     enough = _enough(frame).sum(-1) >= LEAST_CAMERAS
     looks, rows, best = looked_again(faults.looks, frame, enough, filter.maps, filter.fps)
@@ -266,7 +266,7 @@ def watched(
     """
     doubtful = _few_or_wide(found, frame)
     also = started if astray is None else started | astray
-    if not bool((doubtful | also[:, None] | (faults.doubted != 0)[:, None]).any()):
+    if not bool((doubtful | also[:, None] | (faults.doubted != 0.0)[:, None]).any()):
         return faults, also
     enough = _enough(frame)
     doubtful = doubtful | (started[:, None] & (_noise(filter, found, frame) > _WIDE))
@@ -302,7 +302,7 @@ def with_returned(
 
 def _enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:
     """Return which cameras see so much of a person that they tell whether it is the body."""
-    return (frame.inlier > 0).sum(-1) >= LEAST_JOINTS
+    return (frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS
 
 
 def _few_or_wide(found: CorrectedBody, frame: KeypointFrame) -> Bool[Tensor, "B C"]:

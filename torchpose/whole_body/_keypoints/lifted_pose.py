@@ -155,17 +155,17 @@ class PoseLifter(nn.Module):
         each = mapped(lambda value: value.unflatten(0, sure.shape[:2]), self._by_camera(*flat))
         (joints, std), memory = each
         joints = self._without_lean(joints, rays, sure, memory.roll)
-        enough = ((sure > 0).sum(-1, keepdim=True) >= _LEAST_JOINTS).to(rays)
+        enough = ((sure > 0.0).sum(-1, keepdim=True) >= _LEAST_JOINTS).to(rays)
         share = enough / enough.sum(1, keepdim=True).clamp_min(1)
         mean = (share[..., None] * (joints @ self.view.rotation)).sum(1)
-        std = torch.where(share.sum(1) > 0, (share * std).sum(1), torch.inf)
+        std = torch.where(share.sum(1) > 0.0, (share * std).sum(1), torch.inf)
         return Lifted(mean, std), memory
 
     def _by_camera(
         self, rays: Float[Tensor, "N J 3"], sure: Float[Tensor, "N J"], memory: LifterMemory
     ) -> tuple[Lifted, LifterMemory]:
         """Return what is lifted from single cameras, in axes of the cameras turned upright."""
-        roll, turned = next_roll(memory.roll, rays[..., :2], sure > 0, self.fps)
+        roll, turned = next_roll(memory.roll, rays[..., :2], sure > 0.0, self.fps)
         seen = lifting_features((rays @ roll.turn.mT)[..., :2], sure, self.fps)
         before = memory.network.masked_fill(turned[:, None, None], 0.0)
         seen, before = (value.to(self.network.places.weight) for value in (seen, before))
@@ -218,7 +218,7 @@ def telling(maps: RigMaps, joints: Float[Tensor, "*batch J 3"]) -> Float[Tensor,
     """Return k = 1 + (a / a_0)^2 with the largest angle a between the rays of cameras to the pelvis."""
     rays = torch.nn.functional.normalize(joints[..., [_PELVIS], :] - maps.centre, dim=-1)
     chord = torch.cdist(rays, rays, compute_mode="donot_use_mm_for_euclid_dist").amax((-2, -1))
-    return 1 + (chord / _TELLING).square()
+    return 1.0 + (chord / _TELLING).square()
 
 
 def _upright_roll(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -327,18 +327,18 @@ def corrected_by(
         joints, jacobian = body.linearise(point) if iteration else at_mean
         apart = (joints - joints[..., [_PELVIS], :])[..., _OTHERS, :]
         H = (jacobian - jacobian[..., [_PELVIS], :, :])[..., _OTHERS, :, :].flatten(-3, -2)
-        apart, H = _of_expected_size(filter, point, apart.flatten(-2), H, 1 - 1 / k)
+        apart, H = _of_expected_size(filter, point, apart.flatten(-2), H, 1.0 - 1 / k)
         H = scale[..., None] * H
         off = scale * (wanted - apart)
         HP = H @ cov
         spread = HP @ H.mT
-        chol = torch.linalg.cholesky((spread + spread.mT) / 2 + torch.eye(H.shape[-2]).to(H))
+        chol = torch.linalg.cholesky((spread + spread.mT) / 2.0 + torch.eye(H.shape[-2]).to(H))
         apart_from_mean = off[..., None] + H @ d[..., None]
         d = (HP.mT @ torch.cholesky_solve(apart_from_mean, chol)).squeeze(-1)
         point = body.moved(mean, d)
     U = torch.linalg.solve_triangular(chol, HP, upper=False)
     cov = cov - U.mT @ U
-    return state._replace(mean=point, cov=(cov + cov.mT) / 2)
+    return state._replace(mean=point, cov=(cov + cov.mT) / 2.0)
 
 
 def _of_expected_size(

@@ -108,7 +108,7 @@ def lifting_features(
         rays: (x, y) of K^-1 [u, v, 1], anything finite where there is no keypoint.
         confidence: of the keypoints, 0 where there is none. fps: frames per second.
     """
-    there = confidence > 0
+    there = confidence > 0.0
     known = rays.masked_fill(~there[..., None], torch.nan)
     middle = known.nanmedian(-2, keepdim=True).values.nan_to_num()
     extent = (known - middle).norm(dim=-1).nanmedian(-1).values

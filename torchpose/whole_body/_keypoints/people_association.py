@@ -66,7 +66,7 @@ def detection_gains(
         readings_of(pairs, filter.exchange), seen, filter.maps, beliefs, filter.exchange,
         joint_cov[persons], marginal=True, width=width,
     )  # fmt: skip
-    there = pairs.inlier > 0
+    there = pairs.inlier > 0.0
     about = _of_another(seen, joint_cov[persons])
     of_another = torch.where(seen.in_front, about, -filter.maps.log_area[:, None])
     gain = (weighed.log_joint - torch.where(there, of_another, 0.0)).sum(-1)
@@ -96,7 +96,7 @@ def assign(gains: Float[Tensor, "P C D"]) -> Int[Tensor, "P C"]:
     Where no two persons want the same detection, each has the best; else the Hungarian method decides.
     """
     best, wanted = gains.max(-1)
-    wanted = torch.where(best > 0, wanted, -1)
+    wanted = torch.where(best > 0.0, wanted, -1)
     clash = (wanted[:, None] == wanted) & (wanted[:, None] >= 0)
     clash = clash.sum(0) > 1
     for camera in clash.any(0).nonzero().flatten().tolist():
@@ -176,7 +176,7 @@ def group_detections(
     Args:
         maps: the cameras. frame: [D, C, J]. free: which detections are to be grouped.
     """
-    free = free & ((frame.inlier > 0).sum(-1) >= LEAST_JOINTS).mT
+    free = free & ((frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS).mT
     if len(maps.shift) == 1:
         return free[0].nonzero()
     pairs = _pairs(free)
@@ -244,7 +244,7 @@ def _bone_penalty(joints: Float[Tensor, "H J 3"]) -> Float[Tensor, " H"]:
 def _disjoint(groups: Int[Tensor, "H C"], score: Float[Tensor, " H"]) -> Int[Tensor, "G C"]:
     """Return groups that share no detection, the one of the largest score first."""
     found = []
-    while bool((score > 0).any()):
+    while bool((score > 0.0).any()):
         group = groups[score.argmax()]
         found.append(group)
         shared = ((groups == group) & (group >= 0)).any(-1)

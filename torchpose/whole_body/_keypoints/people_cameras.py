@@ -99,14 +99,14 @@ def strays_of(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> Bool[Tensor, 
         frame: [D, C, J]; of a detection so many joints count with which a person could begin.
         chosen: the persons' detections, -1 if none.
     """
-    enough = (frame.inlier > 0).sum(-1) >= LEAST_JOINTS
+    enough = (frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS
     left = enough.mT & ~owned_detections(chosen, len(frame.inlier))
     return left.any(-1) & (chosen < 0).any(0)
 
 
 def _of_witnesses(frame: KeypointFrame) -> KeypointFrame:
     """Return the keypoints [1, C, W J] of the W persons who have most, side by side."""
-    count = (frame.inlier > 0).sum((-2, -1))
+    count = (frame.inlier > 0.0).sum((-2, -1))
     rows = count.topk(min(_WITNESSES, len(count))).indices.sort().values
     some = frame.take(rows)
     none = frame.map(lambda value: value.new_ones(_WITNESSES - len(rows), *value.shape[1:]))

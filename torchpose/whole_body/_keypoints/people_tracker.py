@@ -108,7 +108,7 @@ class PeopleTracker:
         """
         stream = _nobody(frame) if stream is None else stream
         detected, frame = frame, righted(self.tracker, frame, stream.faults)
-        there = (frame.inlier > 0).any(-1).mT  # [C, D]
+        there = (frame.inlier > 0.0).any(-1).mT  # [C, D]
         found, free, predicted = None, there, None
         if stream.bodies is not None:
             stream, found, free, predicted = self._followed(stream, frame, there)
@@ -156,7 +156,7 @@ class PeopleTracker:
         after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted, watch=False)
         found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
         weak = self._weak(stream)
-        explained = (gains > 0).masked_fill(weak[:, None, None], False).any(0)
+        explained = (gains > 0.0).masked_fill(weak[:, None, None], False).any(0)
         owned = owned_detections(chosen[~weak], there.shape[1])
         free = there & ~explained & ~owned
         return stream._replace(bodies=after), found, free, predicted
@@ -183,7 +183,7 @@ class PeopleTracker:
         """
         absent = away[:, None, None]
         near = gains.masked_fill(absent, -math.inf)
-        chosen, wanted = assign(near), (near > 0).any(0)
+        chosen, wanted = assign(near), (near > 0.0).any(0)
         if bool(((chosen < 0).any(0)[:, None] & there & ~wanted).any()):
             wide = detection_gains(self.tracker.filter, predicted, frame, _DOUBT)
             chosen = left_over(wide.masked_fill(wanted | absent, -math.inf), chosen)
@@ -307,13 +307,13 @@ class PeopleTracker:
             (stream.identity == 0) & ~doubled & (hits >= max(_CONFIRM_FRAMES, _CONFIRM_TIME * fps))
         )
         identity = torch.where(new, stream.n_confirmed + new.cumsum(0), stream.identity)
-        unseen = torch.where(n_seen > 0, 0.0, stream.unseen + 1)
+        unseen = torch.where(n_seen > 0, 0.0, stream.unseen + 1.0)
         return stream._replace(
             hits=hits,
-            missed=torch.where(agreed, 0.0, stream.missed + 1),
+            missed=torch.where(agreed, 0.0, stream.missed + 1.0),
             unseen=unseen,
             away=~agreed & (stream.away | (unseen > _ALONE_TIME * fps)),
-            doubled=torch.where(doubled, stream.doubled + 1, 0.0),
+            doubled=torch.where(doubled, stream.doubled + 1.0, 0.0),
             identity=identity,
             n_confirmed=stream.n_confirmed + int(new.sum()),
         )
@@ -385,7 +385,7 @@ def _needed(owner: Bool[Tensor, "P G"], found: PeopleFrame | None) -> Float[Tens
 def _doubled(joints: Float[Tensor, "P J 3"]) -> Bool[Tensor, " P"]:
     """Return who is at the place of somebody who began before."""
     apart = (joints[:, None] - joints).norm(dim=-1).mean(-1)
-    earlier = torch.ones_like(apart).tril(-1) > 0
+    earlier = torch.ones_like(apart).tril(-1) > 0.0
     return (torch.where(earlier, apart, math.inf) < _SAME).any(-1)
 
 

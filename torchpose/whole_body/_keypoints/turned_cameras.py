@@ -109,11 +109,11 @@ def find_turns(
         joints = triangulate_all(maps, turned(frame, turn, maps), frame.inlier > 0)
     rotvec = _rotvec(turn)
     for width in widths:
-        large = 1 + rotvec.square().sum(-1) / _TURN**2
+        large = 1.0 + rotvec.square().sum(-1) / _TURN**2
         prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
         prior = prior[..., None].expand_as(rotvec).flatten(1)
         chol, F, b, S, g = _equations(frame, rays @ turn.mT, joints, maps, width)
-        L = torch.linalg.cholesky((S + S.mT) / 2 + torch.diag_embed(prior))
+        L = torch.linalg.cholesky((S + S.mT) / 2.0 + torch.diag_embed(prior))
         step = torch.cholesky_solve((-g - prior * rotvec.flatten(1))[..., None], L)
         joints = joints + torch.cholesky_solve(b + F @ step[:, None], chol).squeeze(-1)
         rotvec = rotvec + step.view_as(rotvec)

@@ -35,7 +35,7 @@ def by_right_cameras(
     rows = None
     if right.inlier.shape[1] >= LEAST_CAMERAS:
         several = stream.begun & (stream.alone < 0)
-        fresh = pose.started & (faults.looks.n_frames == 0)
+        fresh = pose.started & (faults.looks.n_frames == 0.0)
         faults, due = watched(filter, faults, found, right, several, fresh)
         if bool(faults.off.any()):
             faults = with_returned(filter, faults, found, given)

@@ -33,8 +33,8 @@ def bidirectional(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
     [-0.5]
     """
     model, overlap, image = (count.double() for count in counts)
-    missed = (model - overlap) / model.clamp_min(1) + (model == 0)
-    unexplained = (image - overlap) / image.clamp_min(1) + (image == 0)
+    missed = (model - overlap) / model.clamp_min(1) + (model == 0.0)
+    unexplained = (image - overlap) / image.clamp_min(1) + (image == 0.0)
     return -(missed + unexplained).mean(-1)
 
 

@@ -111,7 +111,7 @@ def outline(limbs: ProjectedLimbs, height: int, width: int) -> Outlines:
     dx, dy, dr = bx - ax, by - ay, ra - rb
     squared = dx * dx + dy * dy
     apart = squared - dr * dr
-    exists = apart > 0
+    exists = apart > 0.0
     inverse = (squared + (~exists)).reciprocal()  # where there are none, any finite number does
     along, across = dr * inverse, apart.clamp_min(0).sqrt() * inverse
     edges = []
@@ -128,8 +128,8 @@ def outline(limbs: ProjectedLimbs, height: int, width: int) -> Outlines:
     first = torch.minimum(ay - ra, by - rb).ceil().clamp_(0, height)
     last = torch.maximum(ay + ra, by + rb).floor().clamp_(-1, height - 1)
     right, left = torch.maximum(ax + ra, bx + rb), torch.minimum(ax - ra, bx - rb)
-    seen = limbs.visible & (right >= 0) & (left <= width - 1)
-    rows = (last - first + 1).clamp_min_(0).where(seen, 0.0)
+    seen = limbs.visible & (right >= 0.0) & (left <= width - 1)
+    rows = (last - first + 1.0).clamp_min_(0).where(seen, 0.0)
     return Outlines(
         torch.stack(discs).view(2, 3, -1),
         torch.stack(edges).view(2, 4, -1),
