@@ -29,8 +29,8 @@ from benchmarks.keypoint_bodies.clips import (
 from benchmarks.keypoint_bodies.scoring import Estimate
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
+from torchpose.priors._lifting_network import INPUTS, lifting_features
 from torchpose.whole_body._keypoints.lifted_pose import place_on_rays
-from torchpose.whole_body._keypoints.lifting_network import INPUTS, lifting_features
 
 MLP, GRU, MEAN = "mlp", "gru", "mean-pose"
 _STEPS, _FRAMES = 4_000, 48

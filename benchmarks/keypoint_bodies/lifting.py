@@ -25,7 +25,7 @@ from benchmarks.keypoint_bodies.clips import (
 from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples
 from torchpose.body import BODY_15
 from torchpose.io._mocap import MocapClip
-from torchpose.whole_body._keypoints.lifting_network import LiftingNetwork, LiftingNetworkInfo
+from torchpose.priors._lifting_network import LiftingNetwork, LiftingNetworkInfo
 
 __all__ = ["fit_shipped"]
 

@@ -27,8 +27,8 @@ from benchmarks.keypoint_bodies.seats import seated
 from torchpose.body import BODY_15
 from torchpose.io._mocap import MocapClip
 from torchpose.math import euler_to_matrix
+from torchpose.priors._lifting_network import lifting_features
 from torchpose.whole_body._keypoints.keypoint_reader import INLIER
-from torchpose.whole_body._keypoints.lifting_network import lifting_features
 
 __all__ = ["LiftingExamples", "with_arms"]
 

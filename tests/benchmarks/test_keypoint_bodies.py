@@ -43,7 +43,7 @@ from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.demo._rendering.walk import walk, walk_clip
 from torchpose.evaluation import Report
-from torchpose.whole_body._keypoints.lifting_network import LiftingNetwork
+from torchpose.priors._lifting_network import LiftingNetwork
 
 PEERS = [name for name in METHODS if name not in OURS]
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpose._core.module_state import outside_inference
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._direction_density import DirectionDensity
+from torchpose.upper_body._lifted_arms import LiftedBones
 from torchpose.upper_body._limb_nodes import (
     LimbNodes,
     flat_rows,
@@ -54,6 +55,7 @@ class ArmInput(NamedTuple):
         lengths: the lengths of both bones, metres, [B, 2, M, 2].
         borders: the planes of the image's borders, then the optical axis, [B, 2, M, P + 1, 3]; None where
             nothing is known of hands that are not measured. log_inside: see `Absence`, [B, 2].
+        bones: the lifted upper arms and forearms, [B, 2, M, 2, 3] and [B, 2, 2]; None without any.
     """
 
     shoulder: Tensor
@@ -66,6 +68,7 @@ class ArmInput(NamedTuple):
     lengths: Tensor
     borders: Tensor | None = None
     log_inside: Tensor | None = None
+    bones: LiftedBones | None = None
 
 
 class Arms(NamedTuple):
@@ -75,11 +78,13 @@ class Arms(NamedTuple):
         directions: the directions of upper arm and forearm, upright axes, [B, 2, M, N, 6].
         log_weight: the log of the likelihood times the node's share of the directions, [B, 2, M, N].
         log_prior: the log-density of the prior, [B, 2, M, N].
+        log_told: the part of `log_weight` that lifted bones say, [B, 2, M, N]; None without any.
     """
 
     directions: Tensor
     log_weight: Tensor
     log_prior: Tensor
+    log_told: Tensor | None = None
 
     @property
     def log_evidence(self) -> Float[Tensor, "B 2 M"]:
@@ -99,7 +104,7 @@ class ArmState(NamedTuple):
     Attributes:
         directions: the directions of the hypotheses, upright axes, [B, 2, N, 6].
         weight: their weights, normalised, [B, 2, N].
-        log_evidence: the log-evidence of the frame given those before, [B, 2].
+        log_evidence: the log-evidence of the frame's keypoints given the frames before, [B, 2].
         prior, predicted: the density of the prior, and that predicted from the frames before, at each
             hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
@@ -157,10 +162,12 @@ class ArmChain:
             rows = (known == known.new_tensor(ends)).all(-1).nonzero()[:, 0]
             parts.append((rows, self._weighed(arm, ends, sizes[ends], count, rows)))
         order = torch.cat([rows for rows, _ in parts]).argsort()
-        joined = (
-            torch.cat(values, 1)[:, order] for values in zip(*(x for _, x in parts), strict=True)
-        )
-        return Arms(*(value.view(*arm.known.shape[:2], *value.shape[2:]) for value in joined))
+        joined: Iterator[Any] = (
+            None if values[0] is None else torch.cat(values, 1)[:, order]
+            for values in zip(*(x for _, x in parts), strict=True)
+        )  # fmt: skip
+        shape = arm.known.shape[:2]
+        return Arms(*(x if x is None else x.view(*shape, *x.shape[2:]) for x in joined))
 
     def _weighed(
         self,
@@ -191,30 +198,41 @@ class ArmChain:
             in_view = log_in_view(places, upper.start, _taken(arm.middle, rows))
             of_elbow, of_hand = in_view.tensor_split(sizes[:1], -1)
             weight = weight + of_elbow[..., None] + of_hand.view(weight.shape)
-        return self._likeliest(upper, lower, weight.flatten(-2), count)
+        told = None
+        if arm.bones is not None:
+            told = _log_told(LiftedBones(*(_taken(part, rows) for part in arm.bones)), upper, lower)
+            told = told.flatten(-2).expand_as(weight.flatten(-2))
+        return self._likeliest(upper, lower, weight.flatten(-2), told, count)
 
     def _likeliest(
-        self, upper: LimbNodes, lower: LimbNodes, weight: Float[Tensor, "*batch N"], count: int
+        self,
+        upper: LimbNodes,
+        lower: LimbNodes,
+        seen: Float[Tensor, "*batch N"],
+        told: Float[Tensor, "*batch N"] | None,
+        count: int,
     ) -> Arms:
         """Return the hypotheses of largest weight, that of the prior included.
 
         Args:
-            upper, lower: the nodes of both bones. weight: the log of the likelihood of all their pairs.
-            count: the number of hypotheses, at most.
+            upper, lower: the nodes of both bones. seen, told: the log of the likelihood of all their pairs,
+                by keypoints and by lifted bones. count: the number of hypotheses, at most.
         """
+        weight = seen if told is None else seen + told
         uppers = upper.directions.expand_as(upper.ends)
         if weight.shape[-1] <= count:
             prior = self.density.of_arms(uppers, lower.axes, lower.turns).flatten(-2)
             shape = *upper.ends.shape[:-1], len(lower.turns), 3
             bones = uppers[..., None, :], lower.directions
             directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
-            return Arms(directions, weight, prior)
+            return Arms(directions, weight, prior, told)
         prior = self._prior(uppers, lower, weight, count)
         best = (weight + prior).topk(count, -1, sorted=False).indices
         return Arms(
             lower.chosen(uppers, flat_rows(best, weight.shape[-1])),
             weight.gather(-1, best),
             prior.gather(-1, best),
+            None if told is None else told.gather(-1, best),
         )
 
     def _prior(
@@ -421,6 +439,17 @@ def _lower_nodes(
     return nodes_anywhere(nodes.ends, length, axes, count)
 
 
+def _log_told(
+    bones: LiftedBones, upper: LimbNodes, lower: LimbNodes
+) -> Float[Tensor, "*batch U N"]:
+    """Return the log-likelihood k (d^T v - 1) of all pairs of nodes, given the directions v of both bones."""
+    k = bones.precision[..., None, :, None]
+    upper_arm, forearm = bones.directions[..., None, :, :].unbind(-2)
+    of_upper = k[..., 0, :] * ((upper.directions * upper_arm).sum(-1) - 1)
+    of_lower = k[..., 1, :, None] * ((lower.directions * forearm[..., None, :]).sum(-1) - 1)
+    return of_upper[..., None] + of_lower
+
+
 def _given_later(state: ArmState, message: Float[Tensor, "B 2 N"]) -> ArmState:
     """Return the posterior with the backward message, to the power that it counts with."""
     power = torch.where(state.seen, _LATER, 1.0)[..., None]
@@ -432,8 +461,10 @@ def _belief(
     arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"], seen: Bool[Tensor, "B 2"]
 ) -> ArmState:
     log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(_LEAST).log()
-    evidence = torch.logsumexp(log_weight, -1)
-    weight = (log_weight - evidence[..., None]).exp()
+    total = evidence = torch.logsumexp(log_weight, -1)
+    if arms.log_told is not None:
+        evidence = torch.logsumexp(log_weight - arms.log_told[:, :, 0], -1)
+    weight = (log_weight - total[..., None]).exp()
     return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen)
 
 

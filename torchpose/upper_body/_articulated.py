@@ -7,6 +7,7 @@ lengths of bones are learnt on the way (`BodyLengths`).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
@@ -21,6 +22,7 @@ from tqdm.auto import tqdm
 from torchpose._core.module_state import derived
 from torchpose.errors import InputError
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
+from torchpose.priors._lifting_network import LiftingNetwork, shipped_lifting_network
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmChain, ArmState
 from torchpose.upper_body._articulated_frame import (
@@ -57,6 +59,7 @@ from torchpose.upper_body._estimator import (
     repeat_last,
 )
 from torchpose.upper_body._lean import lean_angle, roll, seen_lean
+from torchpose.upper_body._lifted_arms import LiftedBones, lift
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._nearby_frames import averaged_over_frames, frames_of_reach
 from torchpose.upper_body._pose_track import PoseTrack
@@ -107,6 +110,8 @@ class ArticulatedState(NamedTuple):
             image, and so no depth that arms could rule out; and starts again until the frame fits a body.
         told: what the pose of the last frame holds of torso and lengths; None before the first, and after
             several frames at a time.
+        memory: what the network remembers that lifts bones, [B, L, W]; None before the first frame, and
+            where shoulders and elbows are not among the keypoints.
     """
 
     root: Tensor
@@ -122,6 +127,7 @@ class ArticulatedState(NamedTuple):
     frame: int
     starts: Tensor | None
     told: _Told | None = None
+    memory: Tensor | None = None
 
 
 class _Seen(NamedTuple):
@@ -236,6 +242,7 @@ class ArticulatedFilter(Estimator):
             (like,),
             lambda: Optics.of(info.matrix.to(like)),
         )
+        self.network = derived(owner, "lifting network", (like,), lambda: _network_on(like.device))
         self.root = RootStep(self.grid, self.chain, self.lengths)
 
     def init(
@@ -272,12 +279,14 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        steps, poses = self._steps(state, measured, progress), []
+        bones, memory = self._lifted(measured, state.memory)
+        steps, poses = self._steps(state, measured, bones, progress), []
         while waiting := [*islice(steps, _AT_ONCE)]:
             state, told = waiting[-1].state, waiting[-1].state.told
             pose, told = self._poses([(step.seen, step.arms) for step in waiting], told)
             poses.append(pose)
             state = state._replace(told=told if len(waiting) == 1 else None)
+        state = state._replace(memory=memory)
         return state, self._estimates(poses, len(measured.uv))
 
     def forward(
@@ -295,7 +304,8 @@ class ArticulatedFilter(Estimator):
         if self.ahead:
             measured = averaged_over_frames(measured, lengths, self.ahead)
         state = self.init(len(measured.uv), joints, arm_generators)
-        steps = self._steps(state, measured, progress)
+        bones, _ = self._lifted(measured, None)
+        steps = self._steps(state, measured, bones, progress)
         seen, arms = zip(*((step.seen, step.arms) for step in steps), strict=True)
         lag = int(smoothing) - self.ahead if isinstance(smoothing, int) else None
         found = list(zip(seen, self.chain.smoothed(arms, lengths, lag), strict=True))
@@ -314,13 +324,28 @@ class ArticulatedFilter(Estimator):
         """Return the estimates of whole sequences without smoothing; see `Estimator.forward`."""
         return super().forward(measured, joints, arm_generators, lengths, progress)
 
+    def _lifted(
+        self, measured: MeasuredJoints, memory: Tensor | None
+    ) -> tuple[LiftedBones | None, Tensor | None]:
+        """Return what a network tells of bones in T frames, and what it remembers of them."""
+        if measured.body is None:
+            return None, None
+        places, sure = measured.body
+        matrix = self.optics.matrix
+        rays = (places - matrix[:2, 2]) / matrix.diagonal()[:2]
+        return lift(self.network, rays, sure, self.model.rate, memory)
+
     def _steps(
-        self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
+        self,
+        state: ArticulatedState,
+        measured: MeasuredJoints,
+        bones: LiftedBones | None,
+        progress: bool = False,
     ) -> Iterator[_Step]:
         """Yield the result of each frame."""
         if self.middle_alone:
             measured = with_middle(measured)
-        rays = as_rays(measured, self.optics)
+        rays = as_rays(measured, self.optics, bones)
         facts = facts_of(rays, measured, self.optics.matrix)
         frames, batch_size = split(rays), len(measured.uv)
         with tqdm(total=len(frames), disable=not progress, desc="frames") as bar:
@@ -534,6 +559,12 @@ def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:
     if isinstance(old, Tensor):
         return torch.where(chosen.view(-1, *[1] * (old.ndim - 1)), new, old)
     return type(old)(*(_where(chosen, *both) for both in zip(new, old, strict=True)))
+
+
+def _network_on(device: torch.device) -> LiftingNetwork:
+    """Return the network that comes with the package, on a device."""
+    network = shipped_lifting_network()
+    return network if device.type == "cpu" else copy.deepcopy(network).to(device)
 
 
 def _prior_of(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

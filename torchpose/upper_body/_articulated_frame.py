@@ -13,6 +13,7 @@ from torch.nn.functional import normalize, pad
 from torchpose._core.module_state import index_tensor
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._face_points import FacePoints
+from torchpose.upper_body._lifted_arms import N_BONES, LiftedBones
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._torso_likelihood import NOT_RAISED, REACH, STIFF_SHOULDER, Torso
 
@@ -53,8 +54,9 @@ class RayFrame(NamedTuple):
 
     Attributes:
         rays: K^-1 [u, v, 1] of the joints in `_ROWS`, of length one for the last four; then, for both arms,
-            the way from the end that is measured to the shoulder over its reach, [.., 0]; then nose, eyes
-            and ears, [.., 0]. [B, 18 or 23, 3].
+            the way from the end that is measured to the shoulder over its reach, [.., 0]; then the
+            directions of lifted bones, if there are any; then nose, eyes and ears, [.., 0], if there are
+            any. [B, 18 to 28, 3].
         known: whether each of the eight joints is measured, [B, 8].
         std: the standard deviation of a pixel over the focal length, [B, 8].
         exact: whether every keypoint has full confidence, [B].
@@ -67,6 +69,7 @@ class RayFrame(NamedTuple):
             torso of one joint has no size in the image, and arms alone are a poor witness of how far it is.
         face: the confidence of nose, eyes and ears, [B, 5]; None if there are none.
         log_inside: see `Absence`, 0 where a hand is measured, [B, 2]; None without any evidence.
+        told: k of lifted bones (`LiftedBones`), [B, 5]; None without any.
     """
 
     rays: Tensor
@@ -82,6 +85,7 @@ class RayFrame(NamedTuple):
     extrapolates: Tensor
     face: Tensor | None
     log_inside: Tensor | None = None
+    told: Tensor | None = None
 
 
 class Facts(NamedTuple):
@@ -117,6 +121,7 @@ class UprightFrame(NamedTuple):
         torso: the rays of the torso. face: nose, eyes and ears, or None.
         given: the measurements. facts: what holds for them.
         borders: the planes of the image's borders, then the optical axis, [B, P + 1, 3]; None without any.
+        bones: the lifted bones; None without any.
     """
 
     rays: Tensor
@@ -126,26 +131,31 @@ class UprightFrame(NamedTuple):
     given: RayFrame
     facts: Facts
     borders: Tensor | None = None
+    bones: LiftedBones | None = None
 
 
 def upright(frame: RayFrame, facts: Facts, tilt: Float[Tensor, "B 3 3"]) -> UprightFrame:
     """Return a frame in tilted axes, of a camera that is rolled by the lean of the torso (`roll`)."""
     rows = frame.rays @ tilt  # from the right: turned back
+    first, bones = _LIFTS.stop, None
+    if frame.told is not None:
+        bones, first = LiftedBones(rows[:, first : first + N_BONES], frame.told), first + N_BONES
     rise = torch.where(frame.lifted, rows[:, _LIFTS, 1], NOT_RAISED)
     torso = Torso(rows[:, _TORSO], frame.torso, frame.torso_std, rise, facts.sided)
     face = None
     if frame.face is not None and facts.expected is not None:
-        face = FacePoints(rows[:, _LIFTS.stop :, :2], frame.face, facts.expected)
+        face = FacePoints(rows[:, first:, :2], frame.face, facts.expected)
     limbs = rows[:, _LIMBS].unflatten(1, (2, 2))
     borders = None if facts.borders is None else facts.borders @ tilt
-    return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts, borders)
+    return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts, borders, bones)
 
 
-def as_rays(measured: MeasuredJoints, optics: Optics) -> RayFrame:
+def as_rays(measured: MeasuredJoints, optics: Optics, bones: LiftedBones | None = None) -> RayFrame:
     """Return the measurements of T frames as rays, [B, T, ...].
 
     Args:
         measured: the measurements, [B, T, ...]. optics: those of the prior's camera.
+        bones: what a network tells of them, or None.
     """
     known, rows = measured.mask, index_tensor(_ROWS, measured.mask.device)
     rays = pad(measured.uv, (0, 1), value=1.0) @ optics.inverse.mT
@@ -156,6 +166,8 @@ def as_rays(measured: MeasuredJoints, optics: Optics) -> RayFrame:
     lifts, lifted = _lifts(rays, known)
     of_joints, of_limbs = rays.index_select(-2, rows).tensor_split([_LIMBS.start], -2)
     parts = [of_joints, normalize(of_limbs, dim=-1), lifts]
+    if bones is not None:
+        parts.append(bones.directions)
     face, matrix = measured.face, optics.matrix
     if face is not None:
         places = (face.places - matrix[:2, 2]) / matrix.diagonal()[:2]
@@ -166,6 +178,7 @@ def as_rays(measured: MeasuredJoints, optics: Optics) -> RayFrame:
         torch.cat(parts, -2), known, std, exact, torso, std.index_select(-1, rows[_TORSO]), lifted,
         limbs, *_noise_along(std, known), (torso.sum(-1) > 1) & ~limbs[..., 0].any(-1),
         None if face is None else face.confidence, _log_inside(measured),
+        None if bones is None else bones.precision,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from torchpose.upper_body._articulated_poses import bones_of
 from torchpose.upper_body._articulated_torso import shoulder_places
 from torchpose.upper_body._body_lengths import BodyLengths, Sizes
 from torchpose.upper_body._face_points import face_evidence
+from torchpose.upper_body._lifted_arms import LiftedBones
 from torchpose.upper_body._root_grid import RootGrid
 from torchpose.upper_body._torso_likelihood import Root, middle_of_shoulders
 
@@ -103,6 +104,9 @@ class RootStep(NamedTuple):
             metres = self.lengths.unit * self.grid.depth  # heads of children are nearly full-grown
             of_face = face_evidence(frame.face, std, metres, self.grid.turn)
             believed = believed * of_face[:, None].exp()
+        if frame.bones is not None:
+            of_bones = power[:, None] * _turn_of_lifted(frame.bones, self.grid.turn)
+            believed = believed * of_bones[:, None, None].exp()
         if fresh is not None:
             far = self.grid.at_all_depths(believed)
             said, limbs = self._weighed(frame, far, last, sizes), frame.given.limbs
@@ -216,7 +220,20 @@ def _arm_input(
     return ArmInput(
         shoulder, middle, rays, given.limbs, frame.facts.patterns,
         noise[:, :, None] * depth.square() + loose, axes, bones, borders, given.log_inside,
+        None if frame.bones is None else _lifted_arms(frame.bones, axes),
     )  # fmt: skip
+
+
+def _turn_of_lifted(bones: LiftedBones, turn: Float[Tensor, " P"]) -> Float[Tensor, "B P"]:
+    """Return the log-likelihood of each turn of the shoulders given the lifted line between them."""
+    left = upright_axes(turn)[:, 0]
+    return bones.precision[:, :1] * (bones.directions[:, 0] @ left.mT - 1)
+
+
+def _lifted_arms(bones: LiftedBones, axes: Float[Tensor, "B M 3 3"]) -> LiftedBones:
+    """Return the lifted bones of both arms, the right one mirrored, in upright axes: [B, 2, M, 2, 3]."""
+    turned = (bones.directions[:, None, 1:] @ axes.mT).unflatten(2, (2, 2)).transpose(1, 2)
+    return LiftedBones(mirrored(turned), bones.precision[:, 1:].unflatten(1, (2, 2)))
 
 
 def _fits(

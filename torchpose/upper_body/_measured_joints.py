@@ -31,6 +31,7 @@ from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._face_points import FacePoints, measure_face
+from torchpose.upper_body._lifted_arms import BodyPoints, measure_body
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
 
@@ -69,6 +70,7 @@ class MeasuredJoints(NamedTuple):
             measured.
         confidence: the confidence of the detector, [B, T, 8], 1 where missing; None where it gives none.
         absence: the evidence that missing hands are outside of the image; None without any.
+        body: all keypoints of the whole body, None where shoulders or elbows are not among them.
     """
 
     uv: Tensor
@@ -78,6 +80,7 @@ class MeasuredJoints(NamedTuple):
     middle: MiddlePoint | None = None
     confidence: Tensor | None = None
     absence: Absence | None = None
+    body: BodyPoints | None = None
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
@@ -274,7 +277,10 @@ def in_level_pixels(
         sure = face.confidence * turn.visible(face.places, matrix)
         places = torch.where(sure[..., None] > 0, turn.points(face.places), 0.0)
         face = face._replace(places=places, confidence=sure)
-    return measured._replace(uv=turned, mask=mask, cov=cov, face=face)
+    body = measured.body
+    if body is not None:
+        body = body.moved(turn.points(body.places), turn.visible(body.places, matrix))
+    return measured._replace(uv=turned, mask=mask, cov=cov, face=face, body=body)
 
 
 def in_prior_pixels(
@@ -313,6 +319,10 @@ def in_prior_pixels(
         face = measure_face(keypoints, confidence, mask, picked.face)
         face = face._replace(places=to_prior.points(face.places))
         measured = measured._replace(face=face)
+    body = measure_body(keypoints, confidence, mask, picked.names)
+    if body is not None:
+        body = body._replace(places=to_prior.points(body.places))
+        measured = measured._replace(body=body)
     measured = in_level_pixels(
         measured, kept_turn(camera, prior), prior.info.matrix_like(measured.uv)
     )

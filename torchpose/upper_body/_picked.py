@@ -26,6 +26,7 @@ class Picked(NamedTuple):
             by estimators that take one kind for the other.
         hand: the kind of the hands, "hand" or "wrist"; None where the names do not tell.
         face: the places of nose, eyes and ears (`FACE`) among the keypoints, -1 if absent.
+        names: of all keypoints.
     """
 
     indices: tuple[int, ...]
@@ -34,6 +35,7 @@ class Picked(NamedTuple):
     hand: str | None = None
     face: tuple[int, ...] = (-1,) * len(FACE)
     of_hands: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
 
     @property
     def wrists_for_hands(self) -> bool:
@@ -106,7 +108,7 @@ def pick_joints(
         of_hands = (f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s",)
     known = canonical_names(names)
     face = tuple(known.index(name) if name in known else -1 for name in FACE)
-    return Picked(tuple(indices), middle, tuple(notes), found.hand, face, of_hands)
+    return Picked(tuple(indices), middle, tuple(notes), found.hand, face, of_hands, tuple(names))
 
 
 def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:

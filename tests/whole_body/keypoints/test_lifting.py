@@ -14,6 +14,13 @@ from torchpose.body._skeleton import other_side
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import FileFormatError
 from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.priors._lifting_network import (
+    Lifted,
+    LiftingNetwork,
+    LiftingNetworkInfo,
+    lifting_features,
+    shipped_lifting_network,
+)
 from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll
@@ -26,13 +33,6 @@ from torchpose.whole_body._keypoints.lifted_pose import (
     PoseLifter,
     corrected_by,
     place_on_rays,
-)
-from torchpose.whole_body._keypoints.lifting_network import (
-    Lifted,
-    LiftingNetwork,
-    LiftingNetworkInfo,
-    lifting_features,
-    shipped_lifting_network,
 )
 
 PELVIS = BODY_15.joint("pelvis")

@@ -16,6 +16,7 @@ from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.priors._lifting_network import Lifted
 from torchpose.whole_body._keypoints.body_kalman import (
     FEW_INLIERS,
     BodyGaussian,
@@ -30,7 +31,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 )
 from torchpose.whole_body._keypoints.known_person import with_usual_trunk
 from torchpose.whole_body._keypoints.lifted_pose import corrected_by
-from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.nested import replaced, taken
 
 FEW_HEADINGS = 2

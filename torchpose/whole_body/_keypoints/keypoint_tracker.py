@@ -11,6 +11,7 @@ from torchpose._core.module_state import derived
 from torchpose.body._articulation import covariances_of
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.priors._lifting_network import Lifted
 from torchpose.whole_body._keypoints.begin_anew import (
     LEAST_JOINTS,
     are_lost,
@@ -52,7 +53,6 @@ from torchpose.whole_body._keypoints.lifted_pose import (
     shares_of_usual,
     spread_of_hidden,
 )
-from torchpose.whole_body._keypoints.lifting_network import Lifted
 from torchpose.whole_body._keypoints.lone_camera import (
     NOBODY,
     SAME_NOISE,

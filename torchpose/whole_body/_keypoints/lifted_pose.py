@@ -32,18 +32,18 @@ from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.priors._lifting_network import (
+    MEMORY,
+    Lifted,
+    lifting_features,
+    shipped_lifting_network,
+)
 from torchpose.whole_body._keypoints.begin_anew import sees_most
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.known_person import length_of_legs, weights_of_legs
 from torchpose.whole_body._keypoints.lifted_lean import without_lean
-from torchpose.whole_body._keypoints.lifting_network import (
-    MEMORY,
-    Lifted,
-    lifting_features,
-    shipped_lifting_network,
-)
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.upright import LEGS, camera_up, upright_of
 

@@ -15,7 +15,7 @@ from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
 from torchpose.body._skeleton import BODY_15
 
-_SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "lifting" / "whole-body.safetensors"
+_SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "lifting" / "whole-body.safetensors"
 _JOINTS = len(BODY_15.names)
 INPUTS = 4 * _JOINTS + 4
 """Number of `lifting_features`."""

@@ -1,0 +1,117 @@
+"""Lift keypoints to the directions of shoulders and arms, by a network that has seen many bodies.
+
+One camera does not see whether a bone points towards it or away. A causal network tells the joints of the
+whole body that go with all keypoints so far (`LiftingNetwork`), with standard deviations s. A bone of the
+length L whose direction it puts at v is likelier to point along d by the density of von Mises and Fisher,
+
+    log p(v | d) = k (d^T v - 1) + const,   k = (L / (f s))^2,
+
+with the deviation s of its far end. The factor f is above 1, since the network errs alike in frames of one
+motion, and most for forearms of persons to whom it was not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from torchpose.body._skeleton import BODY_15, body_joints
+from torchpose.priors._lifting_network import MEMORY, LiftingNetwork, lifting_features
+from torchpose.skeleton._joint_sets import canonical_names
+
+_NEEDED = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right")
+_HIPS = ("hip_left", "hip_right")
+_LEAST_JOINTS = 6  # keypoints, both shoulders among them, without which a frame is not lifted
+_CONFIDENCE = (0.05, 0.97)  # least and largest that the network has seen
+# The line from the right shoulder to the left one, then upper arm and forearm of left and right.
+_NEAR = ("right_shoulder", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow")
+_FAR = ("left_shoulder", "left_elbow", "left_wrist", "right_elbow", "right_wrist")
+_LENGTHS = (0.35, 0.28, 0.25, 0.28, 0.25)  # metres
+_SHOULDERS = [BODY_15.joint(name) for name in ("left_shoulder", "right_shoulder")]
+_FACTORS = (2.1, 2.5, 6.0, 2.5, 6.0)  # f; the line between the shoulders has two ends that err
+N_BONES = len(_FAR)
+"""Number of bones that are lifted."""
+
+
+class BodyPoints(NamedTuple):
+    """Keypoints of the joints of `BODY_15`.
+
+    Attributes:
+        places: pixels, [B, T, 15, 2], 0 where missing. confidence: [B, T, 15], 0 where missing.
+    """
+
+    places: Tensor
+    confidence: Tensor
+
+    def moved(self, places: Tensor, visible: Bool[Tensor, "B T 15"]) -> BodyPoints:
+        """Return the keypoints at other places, missing where they are not visible there."""
+        sure = self.confidence * visible
+        return BodyPoints(torch.where(sure[..., None] > 0, places, 0.0), sure)
+
+
+class LiftedBones(NamedTuple):
+    """What a network tells of the line between the shoulders, and of upper arms and forearms.
+
+    Attributes:
+        directions: [..., 5, 3]. precision: k of each, [..., 5], 0 where nothing is told.
+    """
+
+    directions: Tensor
+    precision: Tensor
+
+
+def measure_body(
+    keypoints: Float[Tensor, "B T J 2"],
+    confidence: Float[Tensor, "B T J"] | None,
+    mask: Bool[Tensor, "B T J"] | None,
+    names: Sequence[str],
+) -> BodyPoints | None:
+    """Return the keypoints of the whole body, None where shoulders and elbows are not among them.
+
+    Args:
+        keypoints, confidence, mask, names: as in `UpperBodyTracker.forward`.
+    """
+    known = canonical_names(names)
+    if not {*_NEEDED} <= {*known}:
+        return None
+    sure = torch.ones_like(keypoints[..., 0])
+    if confidence is not None:
+        sure = confidence.to(keypoints).nan_to_num(0.0)
+    if mask is not None:
+        sure = sure * mask.to(sure)
+    absent = [name for name in _HIPS if name not in known]
+    table = torch.cat([keypoints, sure[..., None]], -1)
+    table = pad(table, (0, 0, 0, len(absent)), value=torch.nan)
+    places, sure = body_joints(table, [*known, *absent]).split([2, 1], -1)
+    there = places.isfinite().all(-1) & (sure[..., 0] > 0)
+    sure = torch.where(there, sure[..., 0].clamp(*_CONFIDENCE), 0.0)
+    return BodyPoints(torch.where(there[..., None], places, 0.0), sure)
+
+
+def lift(
+    network: LiftingNetwork,
+    rays: Float[Tensor, "B T 15 2"],
+    confidence: Float[Tensor, "B T 15"],
+    fps: float,
+    memory: Float[Tensor, "B L W"] | None,
+) -> tuple[LiftedBones, Float[Tensor, "B L W"]]:
+    """Return the directions of bones in T frames, and what the network remembers of them.
+
+    Args:
+        network: of the whole body. rays: (x, y) of K^-1 [u, v, 1]. confidence: 0 where there is no keypoint.
+        fps: frames per second. memory: of the frames before; None at the beginning.
+    """
+    seen = lifting_features(rays, confidence, fps).to(network.places.weight)
+    before = seen.new_zeros(len(seen), *MEMORY) if memory is None else memory
+    (joints, std), after = network(seen, before)
+    far, near = ([BODY_15.joint(name) for name in names] for names in (_FAR, _NEAR))
+    ways, std = (joints[..., far, :] - joints[..., near, :]).to(rays), std[..., far].to(rays)
+    there = confidence > 0
+    enough = (there.sum(-1) >= _LEAST_JOINTS) & there[..., _SHOULDERS].all(-1)
+    precision = (std.new_tensor(_LENGTHS) / (std.new_tensor(_FACTORS) * std)).square()
+    return LiftedBones(normalize(ways, dim=-1), precision * enough[..., None]), after
