@@ -111,9 +111,10 @@ def lifting_features(
     there = confidence > 0.0
     known = rays.masked_fill(~there[..., None], torch.nan)
     middle = known.nanmedian(-2, keepdim=True).values.nan_to_num()
-    extent = (known - middle).norm(dim=-1).nanmedian(-1).values
+    off = torch.where(there[..., None], rays - middle, 0.0)  # no NaN, of which gradients are NaN
+    extent = off.norm(dim=-1).masked_fill(~there, torch.nan).nanmedian(-1).values
     extent = extent.nan_to_num(_USUAL).clamp_min(_SMALLEST)
-    apart = ((known - middle) / extent[..., None, None]).nan_to_num().clamp(-_FARTHEST, _FARTHEST)
+    apart = (off / extent[..., None, None]).clamp(-_FARTHEST, _FARTHEST)
     rate = torch.full_like(extent, min(max(fps / _RATE, _RATES[0]), _RATES[1]))
     parts = (
         apart.flatten(-2),
@@ -123,7 +124,7 @@ def lifting_features(
         extent.log()[..., None],
         rate[..., None],
     )
-    return torch.cat([part.float() for part in parts], -1)
+    return torch.cat([part.to(rays) for part in parts], -1)
 
 
 @cache

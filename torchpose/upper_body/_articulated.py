@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -561,10 +561,13 @@ def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:
     return type(old)(*(_where(chosen, *both) for both in zip(new, old, strict=True)))
 
 
+@cache
 def _network_on(device: torch.device) -> LiftingNetwork:
-    """Return the network that comes with the package, on a device."""
-    network = shipped_lifting_network()
-    return network if device.type == "cpu" else copy.deepcopy(network).to(device)
+    """Return the network that comes with the package, on a device, in double precision.
+
+    In single precision a stream would have other numbers than the whole recording.
+    """
+    return copy.deepcopy(shipped_lifting_network()).to(device, torch.float64)
 
 
 def _prior_of(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

@@ -248,6 +248,8 @@ def apart(values: Any, n_frames: int) -> list[Any]:
         return [values]
     if isinstance(values, Tensor):
         return [*values.unflatten(0, (-1, n_frames)).unbind(1)]
+    if values is None:
+        return [None] * n_frames
     rows = zip(*(apart(value, n_frames) for value in values), strict=True)
     return [type(values)(*row) if hasattr(values, "_fields") else row for row in rows]
 
