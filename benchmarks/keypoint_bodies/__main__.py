@@ -15,12 +15,12 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR --desk
     python -m benchmarks.keypoint_bodies --data DIR --uncalibrated [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
-    python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors
+    python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors [--upper-body]
 
 The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
 is. The fourth shows people who sit to one camera, the fifth people who lie. The sixth shows people whose
 hips and legs are hidden to two cameras. The seventh tilts a camera that nobody calibrated. The eighth prints
-what the constants of the filters of single joints were chosen by. The ninth fits the network that comes with
+what the constants of the filters of single joints were chosen by. The ninth fits a network that comes with
 torchpose and lifts the keypoints of one camera.
 """
 
@@ -51,7 +51,7 @@ from benchmarks.keypoint_bodies.clips import (
     read_kinect,
 )
 from benchmarks.keypoint_bodies.desk import add_desk_table
-from benchmarks.keypoint_bodies.lifting import fit_shipped
+from benchmarks.keypoint_bodies.lifting import fit_shipped, fit_upper_body
 from benchmarks.keypoint_bodies.lying import add_lying_table
 from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, OURS, Method, methods_of, takes
 from benchmarks.keypoint_bodies.real import add_real_table
@@ -81,6 +81,7 @@ def main(
     uncalibrated: bool = False,
     choose: bool = False,
     fit: Path | None = None,
+    upper_body: bool = False,
     quick: bool = False,
 ) -> None:
     """Print the tables.
@@ -100,11 +101,12 @@ def main(
             the lifters of methods beside the filter.
         choose: print the errors of several constants on the clips for that, in place of the tables.
         fit: file for the network that lifts keypoints of one camera, in place of the tables.
+        upper_body: fit that for upper bodies, which goes on from the one for whole bodies.
         quick: few and short clips, to see that it works.
     """
     torch.set_num_threads(threads)
     if fit is not None:
-        fit_shipped(data, quick).save(fit)
+        (fit_upper_body if upper_body else fit_shipped)(data, quick).save(fit)
         return
     report = Report("Whole bodies from keypoints")
     if desk:

@@ -1,4 +1,4 @@
-"""Fit the network that lifts keypoints of one camera, which comes with torchpose.
+"""Fit the networks that lift keypoints of one camera, which come with torchpose.
 
 It sees pieces of recordings of the persons of `clips.TRAINING`, half of them of those of a Kinect, from
 cameras that are drawn anew for each piece (`LiftingExamples`), with a detector's faults.
@@ -6,6 +6,7 @@ cameras that are drawn anew for each piece (`LiftingExamples`), with a detector'
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,14 +26,19 @@ from benchmarks.keypoint_bodies.clips import (
 from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples
 from torchpose.body import BODY_15
 from torchpose.io._mocap import MocapClip
-from torchpose.priors._lifting_network import LiftingNetwork, LiftingNetworkInfo
+from torchpose.priors._lifting_network import (
+    LiftingNetwork,
+    LiftingNetworkInfo,
+    shipped_lifting_network,
+)
 
-__all__ = ["fit_shipped"]
+__all__ = ["fit_shipped", "fit_upper_body"]
 
 _STEPS, _QUICK_STEPS = 10_000, 2
 _LATER_STEPS = 0.2  # of each later fit, as a share of the steps of the first one
 _LATER_RATE = 1e-3  # of learning
 _SEAT_SHARE = 0.25  # of the pieces of the last fit
+_UPPER_SEED = 3  # of the pieces from which upper bodies are learnt
 _LONGEST = 600  # frames of a recording
 _UNIT = 0.3  # metres in which errors count
 _KINECT_SHARE = 0.5  # of the pieces
@@ -47,10 +53,40 @@ def fit_shipped(data: Path, quick: bool = False) -> LiftingNetwork:
     Args:
         data: folder with the sets. quick: few recordings and steps, to see that it works.
     """
+    return _fitted(data, _patterns(quick), _QUICK_STEPS if quick else _STEPS)
+
+
+def fit_upper_body(data: Path, quick: bool = False) -> LiftingNetwork:
+    """Return the network for upper bodies: the whole body's, fitted on to people whose hips are hidden.
+
+    Args:
+        data: folder with the sets. quick: few recordings and steps, to see that it works.
+    """
+    mocap, kinect = _training(data, _patterns(quick))
+    shares = ((1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect))
+    network = copy.deepcopy(shipped_lifting_network()).requires_grad_(True)
+    network.info = replace(
+        network.info, name="upper-body", command=f"{network.info.command} --upper-body"
+    )
+    draw = LiftingExamples(shares, _UPPER_SEED, _SEAT_SHARE, any_rate=True, upper_body=True)
+    steps = max(1, int(_LATER_STEPS * (_QUICK_STEPS if quick else _STEPS)))
+    train_lifter(network, _loss(network, draw), steps, "upper bodies", _LATER_RATE)
+    return network.requires_grad_(False)
+
+
+def _patterns(quick: bool) -> Mapping[str, Sequence[str]]:
+    """Return the patterns of the recordings that networks are fitted to, by set."""
     patterns: Mapping[str, Sequence[str]] = {**TRAINING, KINECT: KINECT_TRAINING}
-    if quick:
-        patterns = {folder: patterns[folder][:1] for folder in (WALKS, KINECT)}
-    return _fitted(data, patterns, _QUICK_STEPS if quick else _STEPS)
+    return {folder: patterns[folder][:1] for folder in (WALKS, KINECT)} if quick else patterns
+
+
+def _training(
+    data: Path, patterns: Mapping[str, Sequence[str]]
+) -> tuple[list[MocapClip], list[MocapClip]]:
+    """Return the recordings of motion capture, and those of a Kinect."""
+    sets = {name: [*recorded(data / name, given, _LONGEST)] for name, given in patterns.items()}
+    kinect = [replace(one, joints=hips_for_pelvis(one.joints)) for one in sets.pop(KINECT)]
+    return [clip for clips in sets.values() for clip in clips], kinect
 
 
 def _fitted(
@@ -62,9 +98,7 @@ def _fitted(
         data: folder with the sets. patterns: of the recordings, by set.
         steps: of AdamW, 32 pieces of 48 frames each. seed: of weights and pieces.
     """
-    sets = {name: [*recorded(data / name, given, _LONGEST)] for name, given in patterns.items()}
-    kinect = [replace(one, joints=hips_for_pelvis(one.joints)) for one in sets.pop(KINECT)]
-    mocap = [clip for clips in sets.values() for clip in clips]
+    mocap, kinect = _training(data, patterns)
     torch.manual_seed(seed)
     info = LiftingNetworkInfo(
         name="whole-body",

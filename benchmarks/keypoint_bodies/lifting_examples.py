@@ -43,8 +43,10 @@ _FOCAL = 1300.0  # pixels
 _LENGTH_STD, _MOST = 0.08, 0.4  # of the logarithms of lengths, and their largest change
 _WIDER = {"hip": 2.0, "shoulder": 1.2}  # by which widths vary more than limbs
 _HIDDEN = (("knee", "ankle"), ("hip", "knee", "ankle"), ("elbow", "wrist"), ("wrist",))
-_LEGS = 2  # kinds of hidden joints, the first ones
 _SHARE_HIDDEN, _SHARE_AT_DESK = 0.25, 0.4  # of the pieces, and of those in which people sit
+_BELOW = ("pelvis", "hip", "knee", "ankle")
+_HIDDEN_OF_UPPER = (("knee", "ankle"), _BELOW, _BELOW, ("elbow", "wrist"), ("wrist",))
+_SHARE_HIDDEN_OF_UPPER = 0.4  # of the pieces from which upper bodies are learnt
 _NEARER, _HIGHER, _CLEAR_OF_SEAT = 1.0, 0.3, 1.3  # metres, of cameras that see people who sit
 _ARMS_OF_OTHERS = 0.3  # share of the pieces
 _SLOWEST, _FASTEST = 12.0, 60.0  # frames per second that are drawn
@@ -79,7 +81,7 @@ class LiftingExamples:
     Args:
         sets: their share of the pieces, and the recordings, of each. seed: of all that is drawn.
         seats: share of the pieces in which people sit. any_rate: draw the frame rate of each piece, whatever
-            that of its recording is.
+            that of its recording is. upper_body: hide hips and legs in more pieces.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class LiftingExamples:
         seed: int = 0,
         seats: float = 0.0,
         any_rate: bool = False,
+        upper_body: bool = False,
     ) -> None:
         self.pool = [_recording(clip) for _, clips in sets for clip in clips]
         shares = [share / sum(map(len, clips)) for share, clips in sets for _ in clips]
@@ -95,6 +98,9 @@ class LiftingExamples:
         self.weights = torch.tensor(shares) * torch.tensor(self.lengths)
         self.generator = torch.Generator().manual_seed(seed)
         self.seats, self.any_rate = seats, any_rate
+        self.hidden, self.share_hidden = _HIDDEN, _SHARE_HIDDEN
+        if upper_body:
+            self.hidden, self.share_hidden = _HIDDEN_OF_UPPER, _SHARE_HIDDEN_OF_UPPER
 
     def __call__(self) -> tuple[Float[Tensor, "N T F"], Float[Tensor, "N T 15 3"]]:
         """Return features, and joints from the pelvis in the axes of the camera, metres."""
@@ -175,13 +181,14 @@ class LiftingExamples:
 
     def _shown(self, sits: Bool[Tensor, "N 1"]) -> Float[Tensor, "N 15"]:
         """Return 0 for joints that are not seen at all in a piece, and 1 for the others."""
-        kinds = [[not name.endswith(kind) for name in BODY_15.names] for kind in _HIDDEN]
-        kind = torch.randint(len(_HIDDEN), (_SEQUENCES,), generator=self.generator)
+        kinds = [[not name.endswith(kind) for name in BODY_15.names] for kind in self.hidden]
+        kind = torch.randint(len(kinds), (_SEQUENCES,), generator=self.generator)
         share = self._uniform(_SEQUENCES, 1)
-        hides = share < _SHARE_HIDDEN
+        hides = share < self.share_hidden
         if self.seats:
-            at_desk = sits & (share >= _SHARE_HIDDEN) & (share < _SHARE_HIDDEN + _SHARE_AT_DESK)
-            kind = torch.where(at_desk[:, 0], kind % _LEGS, kind)
+            at_desk = sits & ~hides & (share < self.share_hidden + _SHARE_AT_DESK)
+            of_legs = len(kinds) - 2  # the first kinds
+            kind = torch.where(at_desk[:, 0], kind % of_legs, kind)
             hides = hides | at_desk
         return torch.where(hides, torch.tensor(kinds)[kind].float(), 1.0)
 

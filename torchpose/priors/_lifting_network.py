@@ -15,7 +15,7 @@ from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
 from torchpose.body._skeleton import BODY_15
 
-_SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "lifting" / "whole-body.safetensors"
+_SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "lifting"
 _JOINTS = len(BODY_15.names)
 INPUTS = 4 * _JOINTS + 4
 """Number of `lifting_features`."""
@@ -128,6 +128,10 @@ def lifting_features(
 
 
 @cache
-def shipped_lifting_network() -> LiftingNetwork:
-    """Return the network that comes with the package; read once."""
-    return LiftingNetwork.load(_SHIPPED)
+def shipped_lifting_network(name: str = "whole-body") -> LiftingNetwork:
+    """Return a network that comes with the package; read once.
+
+    Args:
+        name: "whole-body", or "upper-body", which was fitted on, to people whose hips and legs are hidden.
+    """
+    return LiftingNetwork.load(_SHIPPED / f"{name}.safetensors")

@@ -567,7 +567,7 @@ def _network_on(device: torch.device) -> LiftingNetwork:
 
     In single precision a stream would have other numbers than the whole recording.
     """
-    return copy.deepcopy(shipped_lifting_network()).to(device, torch.float64)
+    return copy.deepcopy(shipped_lifting_network("upper-body")).to(device, torch.float64)
 
 
 def _prior_of(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:
