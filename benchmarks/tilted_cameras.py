@@ -34,7 +34,7 @@ from torchpose.priors._arms import shipped_arm_prior
 PITCHES = (-25.0, -15.0, 0.0, 15.0, 25.0)
 """Degrees by which the camera looks up."""
 
-_EVERY, _FRAMES = 40, 75
+_EVERY, _FRAMES = 14, 75
 _PRIOR_STD = 10.0  # degrees, of the tilt that is chosen
 _OFF = 5.0  # degrees by which a tilt is told wrong
 _ROWS, _DIGITS = [0, 1, 5], (1, 1, 0)  # of `bones.errors`

@@ -72,7 +72,7 @@ def leave_out(data: Path, name: str, quick: bool, kinds: Sequence[str] = LIFTERS
     """
     arms = shipped_arm_prior() if quick else bones.fit_without(data, name)
     if name == _MHAD:
-        views, few = bones.mhad_views(data, 150 if quick else 15), bones.FEW
+        views, few = bones.mhad_views(data, 150 if quick else 4), bones.FEW
         views = [bones.begun(view) for view in views] if quick else views
         own = "kinect-upper-body-small" if quick else "kinect-upper-body"
         prior, hand = torchpose.load_prior(own), "wrist"

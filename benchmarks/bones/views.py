@@ -25,7 +25,8 @@ _SEVEN = ("wrist_left", "elbow_left", "shoulder_left", "neck", "shoulder_right",
 _MHAD = ("left_wrist", "left_elbow", "left_shoulder", "neck", "right_shoulder", "right_elbow",
          "right_wrist")  # fmt: skip
 _OPENPOSE_FACE = ("Nose", "LEye", "REye", "LEar", "REar")
-_PLACE, EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
+_PLACE, EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 4, 150, 3.0
+_MHAD_PERSONS = ("s09", "s10", "s11", "s12")  # the network of upper bodies was fitted to the others
 _KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
 UTD, UTD_PERSONS, UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
@@ -69,7 +70,7 @@ class View(NamedTuple):
 
 
 def mhad_views(data: Path, every: int = EVERY, pitch: float = 0.0) -> list[View]:
-    """Return one recording in fifteen of Berkeley MHAD, 150 frames each, in a camera at 2.5 m.
+    """Return one recording in four of s9 to s12 of Berkeley MHAD, 150 frames each, in a camera at 2.5 m.
 
     Args:
         data: folder with mocap_berkeley_mhad/. every: one recording in so many.
@@ -81,7 +82,8 @@ def mhad_views(data: Path, every: int = EVERY, pitch: float = 0.0) -> list[View]
     ).level_rotation.numpy()  # level axes from the left, camera from the right
     rng = np.random.default_rng(0)
     views = []
-    for path in data_files(data / "mocap_berkeley_mhad", "**/*.npz")[7::every]:
+    files = data_files(data / "mocap_berkeley_mhad", *(f"**/{p}*.npz" for p in _MHAD_PERSONS))
+    for path in files[3::every]:
         with np.load(path) as file:
             names = [str(name) for name in file["names"]]
             picked = [names.index(name) for name in _MHAD]

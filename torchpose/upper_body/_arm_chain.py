@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -162,12 +162,12 @@ class ArmChain:
             rows = (known == known.new_tensor(ends)).all(-1).nonzero()[:, 0]
             parts.append((rows, self._weighed(arm, ends, sizes[ends], count, rows)))
         order = torch.cat([rows for rows, _ in parts]).argsort()
-        joined: Iterator[Any] = (
-            None if values[0] is None else torch.cat(values, 1)[:, order]
-            for values in zip(*(x for _, x in parts), strict=True)
-        )  # fmt: skip
-        shape = arm.known.shape[:2]
-        return Arms(*(x if x is None else x.view(*shape, *x.shape[2:]) for x in joined))
+        told = arm.bones is not None
+        columns = zip(
+            *(cast(tuple[Tensor, ...], x if told else x[:3]) for _, x in parts), strict=True
+        )
+        joined = (torch.cat(values, 1)[:, order] for values in columns)
+        return Arms(*(value.view(*arm.known.shape[:2], *value.shape[2:]) for value in joined))
 
     def _weighed(
         self,
