@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.module_state import derived
+from torchpose._core.module_state import derived, outside_inference
 from torchpose.errors import InputError
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.priors._lifting_network import LiftingNetwork, shipped_lifting_network
@@ -567,7 +567,8 @@ def _network_on(device: torch.device) -> LiftingNetwork:
 
     In single precision a stream would have other numbers than the whole recording.
     """
-    return copy.deepcopy(shipped_lifting_network("upper-body")).to(device, torch.float64)
+    with outside_inference():
+        return copy.deepcopy(shipped_lifting_network("upper-body")).to(device, torch.float64)
 
 
 def _prior_of(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

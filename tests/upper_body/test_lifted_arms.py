@@ -1,0 +1,100 @@
+"""Check what a network that lifts keypoints tells articulated arms."""
+
+import pytest
+import torch
+
+from tests.data import data_dir_or_skip
+from torchpose import PinholeCamera, UpperBodyTracker, load_prior
+from torchpose.io import read_recordings
+from torchpose.math import euler_to_matrix
+from torchpose.priors._lifting_network import shipped_lifting_network
+from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body._lifted_arms import N_BONES, lift, measure_body
+
+ARMS = [f"{joint}_{side}" for joint in ("shoulder", "elbow", "hand") for side in ("left", "right")]
+CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5)
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """Return somebody who is turned by 75 degrees, seen from above by 20, camera axes, [T, 8, 3]."""
+    clip = data_dir_or_skip("kinect_laban") / "Ges03_drawlines.csv"
+    (recording,) = read_recordings([clip])
+    joints = recording.upper_body().joints[:40].double()
+    joints = joints - joints[:, [UPPER_BODY.index("neck")]]
+    angles = torch.deg2rad(torch.tensor([0.0, 20.0, -75.0], dtype=torch.float64))
+    return joints @ euler_to_matrix(angles).mT + torch.tensor([0.0, -0.3, 3.0])
+
+
+def pixels(joints):
+    return 525.0 * joints[..., :2] / joints[..., 2:] + torch.tensor([319.5, 239.5])
+
+
+def off(joints, names, **options):
+    """Return the mean error of elbows and hands from the middle of the shoulders, metres."""
+    rows = [UPPER_BODY.index(name) for name in ARMS]
+    tracker = UpperBodyTracker(
+        load_prior("kinect-upper-body-small"), CAMERA, "articulated", **options
+    )
+    seen = pixels(joints)[:, [UPPER_BODY.index(name) for name in names]]
+    found = tracker(seen[None], names=names).joints3d[0][:, rows]
+    true = joints[:, rows]
+    apart = (x - x[:, :2].mean(1, keepdim=True) for x in (found, true))
+    found, true = apart
+    return float((found - true)[:, 2:].norm(dim=-1).mean())
+
+
+def test_somebody_who_is_turned_is_followed(turned):
+    assert off(turned, [*ARMS, "neck"]) < 0.12
+
+
+def test_the_network_is_why(turned, monkeypatch):
+    """Without what it tells, arms of somebody who is turned are farther off."""
+    names = [*ARMS, "neck"]
+    with_network = off(turned, names)
+    monkeypatch.setattr(
+        "torchpose.upper_body._articulated.ArticulatedFilter._lifted", lambda *_: (None, None)
+    )
+    assert off(turned, names) > 1.5 * with_network
+
+
+def test_nothing_is_told_without_shoulders_and_elbows():
+    seen = torch.zeros(1, 2, 4, 2)
+    assert measure_body(seen, None, None, ["head", "neck", "hand_left", "hand_right"]) is None
+
+
+def test_frames_with_few_keypoints_tell_nothing():
+    names = [
+        "shoulder_left",
+        "shoulder_right",
+        "elbow_left",
+        "elbow_right",
+        "hand_left",
+        "hand_right",
+    ]
+    seen = torch.rand(1, 3, 6, 2, generator=torch.Generator().manual_seed(0))
+    seen[0, 1, 0] = torch.nan  # a shoulder
+    body = measure_body(seen, None, None, names)
+    network = shipped_lifting_network("upper-body")
+    bones, _ = lift(network, *body, 30.0, None)
+    assert bones.directions.shape == (1, 3, N_BONES, 3)
+    assert (bones.precision > 0).all(-1).tolist() == [[True, False, True]]
+    torch.testing.assert_close(bones.directions.norm(dim=-1), torch.ones(1, 3, N_BONES))
+
+
+def test_memory_goes_on_from_block_to_block():
+    names = [
+        "shoulder_left",
+        "shoulder_right",
+        "elbow_left",
+        "elbow_right",
+        "hand_left",
+        "hand_right",
+    ]
+    seen = torch.rand(1, 4, 6, 2, generator=torch.Generator().manual_seed(1))
+    body = measure_body(seen, None, None, names)
+    network = shipped_lifting_network("upper-body")
+    whole, _ = lift(network, *body, 30.0, None)
+    _, memory = lift(network, *(x[:, :2] for x in body), 30.0, None)
+    later, _ = lift(network, *(x[:, 2:] for x in body), 30.0, memory)
+    torch.testing.assert_close(later.directions, whole.directions[:, 2:])
