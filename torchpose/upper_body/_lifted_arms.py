@@ -13,6 +13,7 @@ motion, and most for forearms of persons to whom it was not fitted.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from torchpose._core.module_state import index_tensor, outside_inference
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.priors._lifting_network import MEMORY, LiftingNetwork, lifting_features
 from torchpose.skeleton._joint_sets import canonical_names
@@ -32,6 +34,7 @@ _CONFIDENCE = (0.05, 0.97)  # least and largest that the network has seen
 _NEAR = ("right_shoulder", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow")
 _FAR = ("left_shoulder", "left_elbow", "left_wrist", "right_elbow", "right_wrist")
 _LENGTHS = (0.35, 0.28, 0.25, 0.28, 0.25)  # metres
+_ENDS = tuple(BODY_15.joint(name) for name in (*_NEAR, *_FAR))
 _SHOULDERS = [BODY_15.joint(name) for name in ("left_shoulder", "right_shoulder")]
 _FACTORS = (2.1, 2.5, 6.0, 2.5, 6.0)  # f; the line between the shoulders has two ends that err
 N_BONES = len(_FAR)
@@ -109,9 +112,19 @@ def lift(
     seen = lifting_features(rays, confidence, fps).to(network.places.weight)
     before = seen.new_zeros(len(seen), *MEMORY) if memory is None else memory
     (joints, std), after = network(seen, before)
-    far, near = ([BODY_15.joint(name) for name in names] for names in (_FAR, _NEAR))
-    ways, std = (joints[..., far, :] - joints[..., near, :]).to(rays), std[..., far].to(rays)
+    ends = index_tensor(_ENDS, rays.device)
+    near, far = joints.index_select(-2, ends).to(rays).split(N_BONES, -2)
+    ways, std = far - near, std.index_select(-1, ends[N_BONES:]).to(rays)
     there = confidence > 0
-    enough = (there.sum(-1) >= _LEAST_JOINTS) & there[..., _SHOULDERS].all(-1)
-    precision = (std.new_tensor(_LENGTHS) / (std.new_tensor(_FACTORS) * std)).square()
+    left, right = _SHOULDERS
+    enough = (there.sum(-1) >= _LEAST_JOINTS) & there[..., left] & there[..., right]
+    precision = (_ratios(std.dtype, std.device) / std).square()
     return LiftedBones(normalize(ways, dim=-1), precision * enough[..., None]), after
+
+
+@cache
+def _ratios(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "5"]:
+    """Return L / f of every bone."""
+    with outside_inference():
+        ratios = [length / factor for length, factor in zip(_LENGTHS, _FACTORS, strict=True)]
+        return torch.tensor(ratios, dtype=dtype, device=device)
