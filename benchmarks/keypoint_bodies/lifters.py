@@ -187,7 +187,7 @@ def features(
     """
     matrix = rig.matrix[0]
     rays = (keypoints[:, 0] - matrix[:2, 2]) / matrix.diagonal()[:2]
-    return lifting_features(rays, confidence[:, 0], fps)
+    return lifting_features(rays, confidence[:, 0], fps).float()
 
 
 def _example(clip: Clip) -> tuple[Tensor, Tensor]:
