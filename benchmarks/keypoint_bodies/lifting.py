@@ -62,8 +62,7 @@ def fit_upper_body(data: Path, quick: bool = False) -> LiftingNetwork:
     Args:
         data: folder with the sets. quick: few recordings and steps, to see that it works.
     """
-    mocap, kinect = _training(data, _patterns(quick))
-    shares = ((1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect))
+    shares = _shares(data, _patterns(quick))
     network = copy.deepcopy(shipped_lifting_network()).requires_grad_(True)
     network.info = replace(
         network.info, name="upper-body", command=f"{network.info.command} --upper-body"
@@ -80,13 +79,12 @@ def _patterns(quick: bool) -> Mapping[str, Sequence[str]]:
     return {folder: patterns[folder][:1] for folder in (WALKS, KINECT)} if quick else patterns
 
 
-def _training(
-    data: Path, patterns: Mapping[str, Sequence[str]]
-) -> tuple[list[MocapClip], list[MocapClip]]:
-    """Return the recordings of motion capture, and those of a Kinect."""
+def _shares(data: Path, patterns: Mapping[str, Sequence[str]]) -> Shares:
+    """Return the shares of motion capture and of a Kinect, with their recordings."""
     sets = {name: [*recorded(data / name, given, _LONGEST)] for name, given in patterns.items()}
     kinect = [replace(one, joints=hips_for_pelvis(one.joints)) for one in sets.pop(KINECT)]
-    return [clip for clips in sets.values() for clip in clips], kinect
+    mocap = [clip for clips in sets.values() for clip in clips]
+    return (1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect)
 
 
 def _fitted(
@@ -98,17 +96,16 @@ def _fitted(
         data: folder with the sets. patterns: of the recordings, by set.
         steps: of AdamW, 32 pieces of 48 frames each. seed: of weights and pieces.
     """
-    mocap, kinect = _training(data, patterns)
+    shares = _shares(data, patterns)
     torch.manual_seed(seed)
     info = LiftingNetworkInfo(
         name="whole-body",
         recordings=tuple(f"{folder}/{p}" for folder, chosen in patterns.items() for p in chosen),
         licence="MIT; see the card for the recordings",
         command="python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors",
-        legs=_legs(mocap),
+        legs=_legs(shares[0][1]),
     )
     network = LiftingNetwork(info)
-    shares = ((1 - _KINECT_SHARE, mocap), (_KINECT_SHARE, kinect))
     train_lifter(network, _loss(network, LiftingExamples(shares, seed)), steps, "lifting network")
     later = max(1, int(_LATER_STEPS * steps))
     return with_seats(at_any_rate(network, shares, later, seed), shares, later, seed)

@@ -30,32 +30,24 @@ def pixels(joints):
     return 525.0 * joints[..., :2] / joints[..., 2:] + torch.tensor([319.5, 239.5])
 
 
-def off(joints, names, **options):
+def off(joints):
     """Return the mean error of elbows and hands from the middle of the shoulders, metres."""
     rows = [UPPER_BODY.index(name) for name in ARMS]
-    tracker = UpperBodyTracker(
-        load_prior("kinect-upper-body-small"), CAMERA, "articulated", **options
-    )
+    tracker = UpperBodyTracker(load_prior("kinect-upper-body-small"), CAMERA, "articulated")
+    names = [*ARMS, "neck"]
     seen = pixels(joints)[:, [UPPER_BODY.index(name) for name in names]]
-    found = tracker(seen[None], names=names).joints3d[0][:, rows]
-    true = joints[:, rows]
-    apart = (x - x[:, :2].mean(1, keepdim=True) for x in (found, true))
-    found, true = apart
+    found = tracker(seen[None], names=names).joints3d[0]
+    found, true = (x[:, rows] - x[:, rows[:2]].mean(1, keepdim=True) for x in (found, joints))
     return float((found - true)[:, 2:].norm(dim=-1).mean())
 
 
-def test_somebody_who_is_turned_is_followed(turned):
-    assert off(turned, [*ARMS, "neck"]) < 0.12
-
-
-def test_the_network_is_why(turned, monkeypatch):
-    """Without what it tells, arms of somebody who is turned are farther off."""
-    names = [*ARMS, "neck"]
-    with_network = off(turned, names)
+def test_somebody_who_is_turned_is_followed_by_what_the_network_tells(turned, monkeypatch):
+    with_network = off(turned)
+    assert with_network < 0.12
     monkeypatch.setattr(
         "torchpose.upper_body._articulated.ArticulatedFilter._lifted", lambda *_: (None, None)
     )
-    assert off(turned, names) > 1.5 * with_network
+    assert off(turned) > 1.5 * with_network
 
 
 def test_nothing_is_told_without_shoulders_and_elbows():
@@ -63,36 +55,23 @@ def test_nothing_is_told_without_shoulders_and_elbows():
     assert measure_body(seen, None, None, ["head", "neck", "hand_left", "hand_right"]) is None
 
 
+def scattered(n_frames):
+    """Return keypoints of `ARMS` anywhere."""
+    return torch.rand(1, n_frames, 6, 2, generator=torch.Generator().manual_seed(0))
+
+
 def test_frames_with_few_keypoints_tell_nothing():
-    names = [
-        "shoulder_left",
-        "shoulder_right",
-        "elbow_left",
-        "elbow_right",
-        "hand_left",
-        "hand_right",
-    ]
-    seen = torch.rand(1, 3, 6, 2, generator=torch.Generator().manual_seed(0))
-    seen[0, 1, 0] = torch.nan  # a shoulder
-    body = measure_body(seen, None, None, names)
-    network = shipped_lifting_network("upper-body")
-    bones, _ = lift(network, *body, 30.0, None)
+    seen = scattered(3)
+    seen[0, 1, ARMS.index("shoulder_left")] = torch.nan
+    body = measure_body(seen, None, None, ARMS)
+    bones, _ = lift(shipped_lifting_network("upper-body"), *body, 30.0, None)
     assert bones.directions.shape == (1, 3, N_BONES, 3)
     assert (bones.precision > 0).all(-1).tolist() == [[True, False, True]]
     torch.testing.assert_close(bones.directions.norm(dim=-1), torch.ones(1, 3, N_BONES))
 
 
 def test_memory_goes_on_from_block_to_block():
-    names = [
-        "shoulder_left",
-        "shoulder_right",
-        "elbow_left",
-        "elbow_right",
-        "hand_left",
-        "hand_right",
-    ]
-    seen = torch.rand(1, 4, 6, 2, generator=torch.Generator().manual_seed(1))
-    body = measure_body(seen, None, None, names)
+    body = measure_body(scattered(4), None, None, ARMS)
     network = shipped_lifting_network("upper-body")
     whole, _ = lift(network, *body, 30.0, None)
     _, memory = lift(network, *(x[:, :2] for x in body), 30.0, None)

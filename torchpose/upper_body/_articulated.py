@@ -242,7 +242,6 @@ class ArticulatedFilter(Estimator):
             (like,),
             lambda: Optics.of(info.matrix.to(like)),
         )
-        self.network = derived(owner, "lifting network", (like,), lambda: _network_on(like.device))
         self.root = RootStep(self.grid, self.chain, self.lengths)
 
     def init(
@@ -333,7 +332,7 @@ class ArticulatedFilter(Estimator):
         places, sure = measured.body
         matrix = self.optics.matrix
         rays = (places - matrix[:2, 2]) / matrix.diagonal()[:2]
-        return lift(self.network, rays, sure, self.model.rate, memory)
+        return lift(_network_on(rays.device), rays, sure, self.model.rate, memory)
 
     def _steps(
         self,
