@@ -27,7 +27,7 @@ from benchmarks.keypoint_bodies.clips import (
 )
 from benchmarks.keypoint_bodies.joint_filters import project_one
 from benchmarks.keypoint_bodies.lifters import placed
-from benchmarks.keypoint_bodies.lifting import fit_shipped
+from benchmarks.keypoint_bodies.lifting import fit_shipped, fit_upper_body
 from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples, _at_rate, _recording
 from benchmarks.keypoint_bodies.methods import METHODS, OURS
 from benchmarks.keypoint_bodies.real import predicted, read_filmed
@@ -43,7 +43,7 @@ from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.demo._rendering.walk import walk, walk_clip
 from torchpose.evaluation import Report
-from torchpose.priors._lifting_network import LiftingNetwork
+from torchpose.priors._lifting_network import LiftingNetwork, shipped_lifting_network
 
 PEERS = [name for name in METHODS if name not in OURS]
 
@@ -263,6 +263,15 @@ def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_siz
     network = LiftingNetwork.load(tmp_path / "lifting.safetensors")
     assert network.info.recordings == ("mocap_cmu_walk/s02_*", "kinect_utd_mhad/s01_*")
     assert 0.6 < network.info.legs < 1.0
+
+
+def test_the_network_of_upper_bodies_goes_on_from_that_of_whole_bodies():
+    data = data_dir_or_skip(WALKS).parent
+    data_dir_or_skip(KINECT)
+    fitted, whole = fit_upper_body(data, quick=True), shipped_lifting_network()
+    assert (fitted.info.name, whole.info.name) == ("upper-body", "whole-body")
+    change = (fitted.places.weight - whole.places.weight).abs().max()
+    assert 0 < float(change) < 0.1  # of one step
 
 
 def test_people_are_put_into_seats_with_their_bones_and_their_arms(walker):
