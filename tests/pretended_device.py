@@ -44,10 +44,10 @@ class _Elsewhere(torch.Tensor):
 
     # in pieces, torch changes the shape of tensors in place
     def __matmul__(self, other):
-        return _run(torch.ops.aten.matmul.default, (self, other), {})
+        return _product(self, other)
 
     def __rmatmul__(self, other):
-        return _run(torch.ops.aten.matmul.default, (other, self), {})
+        return _product(other, self)
 
     def __deepcopy__(self, memo):
         return _Elsewhere(self.inner.clone())
@@ -74,6 +74,10 @@ class _Elsewhere(torch.Tensor):
 
 
 class _Mode(TorchDispatchMode):
+    @classmethod
+    def _should_skip_dynamo(cls):
+        return False  # to tell the compiler of each operation takes longer than to add
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return _run(func, args, kwargs or {})
 
@@ -153,16 +157,21 @@ def _autocast_on(entered):
     return autocast
 
 
+def _product(one, other):
+    with torch._C._DisableTorchDispatch():  # its pieces are of tensors of the CPU
+        return _run(torch.ops.aten.matmul.default, (one, other), {})
+
+
 def _run(func, args, kwargs):
-    name, full = _names(func)
-    tensors = _tensors_in((args, *kwargs.values()))
-    there = any(isinstance(x, _Elsewhere) for x in tensors)
+    tensors = _tensors_in((args, *kwargs.values()) if kwargs else args)
+    there = any(type(x) is _Elsewhere for x in tensors)
     wanted = kwargs.get("device")
     if wanted is not None:
         elsewhere = torch.device(wanted).type == PRETENDED
         kwargs = {**kwargs, "device": torch.device("cpu")}
     else:
         elsewhere = there
+    name, full = _names(func) if there else ("", "")
     if there and name not in _COPIES:
         checked = tensors
         if full in _INDEXED:  # indices may lie anywhere
@@ -172,9 +181,12 @@ def _run(func, args, kwargs):
             raise RuntimeError(
                 f"{full}: tensors of two devices, one of shape {list(strangers[0].shape)}"
             )
-    own = map(_inner, args)
-    result = func(*own, **{key: _inner(value) for key, value in kwargs.items()})
-    if args and isinstance(args[0], torch.Tensor) and result is _inner(args[0]):  # in place
+    if there:
+        own = [_inner(x) for x in args]
+        result = func(*own, **{key: _inner(value) for key, value in kwargs.items()})
+    else:
+        result = func(*args, **kwargs)
+    if there and args and result is own[0]:  # in place
         return args[0]
     return _outer(result) if elsewhere else result
 
