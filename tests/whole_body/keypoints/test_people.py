@@ -91,6 +91,7 @@ def test_a_camera_that_is_turned_is_turned_back_for_everybody():
     for track in found:
         angles = torch.rad2deg(angles_of(track.details["camera_turn"][-1]))
         assert angles.tolist() == pytest.approx([0.0, 1.5, 0.0, 0.0], abs=0.1)
+        assert any("c1 (by 1.5" in n and "on a recording of one person" in n for n in track.notes)
 
 
 def with_turns(rig, degrees):

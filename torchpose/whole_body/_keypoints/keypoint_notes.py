@@ -257,7 +257,7 @@ def _turned_back(said: Sequence[str], verb: str) -> str:
     return (
         f"{' and '.join(said)} seem{'s' * (len(said) == 1)} to be turned against the calibration; keypoints "
         f"{verb} turned back, but the position of the person in the room may be wrong; "
-        'refine="extrinsics" (--refine extrinsics) gives corrected cameras'
+        'refine="extrinsics" (--refine extrinsics) on a recording of one person gives corrected cameras'
     )
 
 
