@@ -24,11 +24,11 @@ from torch.nn.functional import normalize
 from benchmarks._lifters import draw_pieces
 from benchmarks.keypoint_bodies.clips import OTHER, detect, mean_left
 from benchmarks.keypoint_bodies.seats import seated
+from torchpose._core.checks import INLIER
 from torchpose.body import BODY_15
 from torchpose.io._mocap import MocapClip
 from torchpose.math import euler_to_matrix
 from torchpose.priors._lifting_network import lifting_features
-from torchpose.whole_body._keypoints.keypoint_reader import INLIER
 
 __all__ = ["LiftingExamples", "with_arms"]
 

@@ -18,6 +18,8 @@ from torchpose.errors import (
 
 MOST_CONFIDENCE = 2.0
 """Of a keypoint: peaks of heat maps may exceed 1, and count as 1; more is a score in percent."""
+INLIER = (0.05, 0.97)
+"""Least and largest prior probability that a keypoint is its joint's, whatever its confidence."""
 CONFIDENCE_ADVICE = "divide scores in percent by 100, and take the sigmoid of logits"
 """What to do with confidences of another scale."""
 STAYS_POSITIVE = "what is learnt stays positive as the exponential of a parameter"

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from torchpose._core.checks import INLIER
 from torchpose._core.module_state import index_tensor, outside_inference
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.priors._lifting_network import MEMORY, LiftingNetwork, lifting_features
@@ -29,7 +30,6 @@ from torchpose.skeleton._joint_sets import canonical_names
 _NEEDED = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right")
 _HIPS = ("hip_left", "hip_right")
 _LEAST_JOINTS = 6  # keypoints, both shoulders among them, without which a frame is not lifted
-_CONFIDENCE = (0.05, 0.97)  # least and largest that the network has seen
 # The line from the right shoulder to the left one, then upper arm and forearm of left and right.
 _NEAR = ("right_shoulder", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow")
 _FAR = ("left_shoulder", "left_elbow", "left_wrist", "right_elbow", "right_wrist")
@@ -92,7 +92,7 @@ def measure_body(
     table = pad(table, (0, 0, 0, len(absent)), value=torch.nan)
     places, sure = body_joints(table, [*known, *absent]).split([2, 1], -1)
     there = places.isfinite().all(-1) & (sure[..., 0] > 0)
-    sure = torch.where(there, sure[..., 0].clamp(*_CONFIDENCE), 0.0)
+    sure = torch.where(there, sure[..., 0].clamp(*INLIER), 0.0)
     return BodyPoints(torch.where(there[..., None], places, 0.0), sure)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchpose._core.checks import (
     CONFIDENCE_ADVICE,
+    INLIER,
     MOST_CONFIDENCE,
     check_pixels,
     check_shape,
@@ -19,8 +20,6 @@ from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError, ShapeError
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
-INLIER = (0.05, 0.97)
-"""Least and largest prior probability that a keypoint is its joint's."""
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 
 
