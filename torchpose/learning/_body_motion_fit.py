@@ -15,9 +15,11 @@ from torch import Tensor
 from torchpose.body._articulation import Articulation, mirror_of
 from torchpose.errors import InputError
 from torchpose.learning._motion_dynamics import (
+    fit_accelerations,
     fit_correlation,
+    fit_decay,
+    fit_drift,
     fit_shifts,
-    fit_velocities,
     long_enough,
     squared_accelerations,
 )
@@ -88,7 +90,9 @@ def fit_body_motion(
     recipe, articulation = recipe or BodyMotionRecipe(), Articulation()
     sets = by_origin(long_enough(sequences))
     _check_joints(articulation, sets)
-    acceleration, decay = fit_velocities(articulation, sets)
+    decay = fit_decay(articulation, sets)
+    drift = fit_drift(articulation, sets, decay)
+    acceleration = fit_accelerations(articulation, sets, decay, drift)
     shift_std, shift_time = fit_shifts(articulation, sets, recipe.least_shift)
     scale_mean, scale_cov = _fit_scales(articulation, sets)
     return BodyMotion(
@@ -101,7 +105,8 @@ def fit_body_motion(
         scale_cov,
         _fit_poses(articulation, sets, recipe),
         articulation=articulation,
-        correlation=fit_correlation(articulation, sets, decay),
+        correlation=fit_correlation(articulation, sets, decay, drift),
+        drift=drift,
     )
 
 
@@ -273,7 +278,8 @@ def acceleration_ratio(motion: BodyMotion, sequences: Sequence[MotionSequence]) 
     body, sums, count = motion.articulation, 0.0, 0
     for own in by_origin(long_enough(sequences)).values():
         known = known_columns(body, own)
-        power = squared_accelerations(body, own, motion.decay) / motion.acceleration.square()
+        left = squared_accelerations(body, own, motion.decay, motion.drift)
+        power = left / motion.acceleration.square()
         sums, count = sums + float(power[known].sum()), count + int(known.sum())
     return math.sqrt(sums / count)
 

@@ -17,13 +17,17 @@ from torchpose.learning._motion_sequences import (
     known_columns,
     known_joints,
 )
+from torchpose.priors._motion_drift import moving
 
 _NEAR, _FAR = 1 / 30, 1 / 15  # seconds, lags between which velocities tell their decay
 _DECAYS = (0.3, 15.0)  # per second
+_DRIFT_LAG = 0.1  # seconds after which velocities tell mean accelerations, and what is left of them
+_SHRUNK = 0.03  # information that there are no mean accelerations, in deviations of what they depend on
+_LEAST_DEVIATION = 0.01  # radians, metres and radians per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5
 _CORRELATED = 0.9  # share of the correlations that other recordings are expected to have
 _SHIFT_LAG = 0.2  # seconds
-_SHIFT_TIMES = (0.05, 5.0)  # seconds; the shape of a person is for ever
+_SHIFT_TIMES = (0.05, 60.0)  # seconds; the shape of a person is for ever
 _USUAL_SHIFT_TIME = 0.5  # seconds, where trunks are rigid
 _RIGID = 1e-4  # metres
 
@@ -46,26 +50,99 @@ def _lags(fps: float) -> tuple[int, int]:
     return near, near + max(1, round((_FAR - _NEAR) * fps))
 
 
-def fit_velocities(articulation: Articulation, sets: MotionSets) -> tuple[Tensor, Tensor]:
-    """Return acceleration and decay [V] of position and angles.
+def fit_decay(articulation: Articulation, sets: MotionSets) -> Float[Tensor, " V"]:
+    """Return the decay [V] of the velocities of position and angles: E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
+    told = torch.stack([known_columns(articulation, own) for own in sets.values()])
+    decays = torch.stack([_decay(articulation, own) for own in sets.values()])
+    return _alike(articulation, _geometric_mean(decays, told))
 
-    Frame by frame, mean velocities of an Ornstein-Uhlenbeck process have
 
-        E[v_t v_(t + k)] ~ exp(-decay k h),   k > 0,
-        E[(v_(t + 1) - v_t)^2] = q^2 / decay (2 (x - 1 + e) - (1 - e)^2) / x^2,   x = decay h,  e = exp(-x).
+def fit_drift(
+    articulation: Articulation, sets: MotionSets, decay: Float[Tensor, " V"]
+) -> Float[Tensor, "V D"]:
+    """Return mean accelerations by pose and velocity, of mirrored bodies as well (`moving`).
+
+    Every set counts alike, and tells only of what it knows. Small regressions on all of that at once would
+    follow accidents of the recordings, so they are shrunk.
+
+    Args:
+        articulation: of the bodies. sets: recordings. decay: of the velocities.
     """
-    powers, decays, known = [], [], []
-    for own in sets.values():
-        decay = _decay(articulation, own)
-        powers.append(squared_accelerations(articulation, own, decay))
-        decays.append(decay)
-        known.append(known_columns(articulation, own))
-    told = torch.stack(known)
+    told = torch.stack([known_columns(articulation, own) for own in sets.values()]).double()
+    pairs = [_changes_of_set(articulation, own, decay) for own in sets.values()]
+    means = torch.stack([x.mean(0) for x, _ in pairs]).mean(0)
+    means[0] = 0.0
+    spread = torch.stack([(x - means).square().mean(0) for x, _ in pairs]).mean(0)
+    size = spread.sqrt().clamp_min(_LEAST_DEVIATION)
+    squares, products = [], []
+    for x, y in pairs:
+        x = (x - means) / size
+        squares.append(x.mT @ x / len(x))
+        products.append(x.mT @ y / len(x))
+    share = told / told.sum(0)
+    square = torch.einsum("kv,kij->vij", share, torch.stack(squares))
+    product = torch.einsum("kv,kiv->vi", share, torch.stack(products))
+    shrunk = square + _SHRUNK * torch.eye(len(size), dtype=torch.float64)
+    found = torch.linalg.solve(shrunk, product) / size
+    found[:, 0] -= found[:, 1:] @ means[1:]
+    return found
+
+
+def fit_accelerations(
+    articulation: Articulation,
+    sets: MotionSets,
+    decay: Float[Tensor, " V"],
+    drift: Float[Tensor, "V D"],
+) -> Float[Tensor, " V"]:
+    """Return the accelerations of position and angles that their mean leaves.
+
+    Args:
+        articulation: of the bodies. sets: recordings. decay: of the velocities. drift: of `fit_drift`.
+    """
+    told = torch.stack([known_columns(articulation, own) for own in sets.values()])
+    powers = [squared_accelerations(articulation, own, decay, drift) for own in sets.values()]
     power = _geometric_mean(torch.stack(powers), told)
-    return (
-        _alike(articulation, power).sqrt().clamp_min(_LEAST_ACCELERATION),
-        _alike(articulation, _geometric_mean(torch.stack(decays), told)),
-    )
+    return _alike(articulation, power).sqrt().clamp_min(_LEAST_ACCELERATION)
+
+
+def _changes_of_set(
+    articulation: Articulation, sequences: Sequence[MotionSequence], decay: Tensor
+) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T V"]]:
+    """Return (1, x, v) of frames, and accelerations beside the decay in the time after them, mirrored too."""
+    found = [_changes(articulation, s, decay) for s in sequences]
+    y = torch.cat(clipped([rate for _, rate in found]))
+    x = torch.cat([state for state, _ in found])
+    mirror = mirror_of(articulation)
+    own = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)  # of the position, in the root's axes
+    columns = torch.cat([torch.arange(3), 3 + mirror.columns])
+    sign = torch.cat([own, mirror.sign])
+    n, root = articulation.n_pose, articulation.n_root
+    angles, first = mirror.columns[root:] - root, x.shape[1] - n
+    other = torch.cat([torch.zeros(1, dtype=torch.long), 1 + angles, first + columns])
+    signs = torch.cat([torch.ones(1, dtype=torch.float64), mirror.sign[root:], sign])
+    return torch.cat([x, x[:, other] * signs]), torch.cat([y, y[:, columns] * sign])
+
+
+def _changes(
+    articulation: Articulation, sequence: MotionSequence, decay: Tensor
+) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T V"]]:
+    """Return (1, x, v) of frames, and mean accelerations beside the decay in the lag after each.
+
+    Those of the position are in the axes that the root has in the frame.
+    """
+    lag = _drift_lag(sequence.fps)
+    v = _velocities(articulation, sequence)
+    n = max(len(v) - lag, 0)
+    point = sequence.point.map(lambda value: value[1 : 1 + n])
+    kept = torch.exp(-decay * lag / sequence.fps)
+    change = v[lag : lag + n] - kept * v[:n]
+    own = (point.rotations[:, 0].mT @ change[:, :3, None]).squeeze(-1)
+    change = torch.cat([own, change[:, 3:]], -1)
+    return moving(articulation, point, v[:n]), change * (decay / (1 - kept))
+
+
+def _drift_lag(fps: float) -> int:
+    return max(1, round(_DRIFT_LAG * fps))
 
 
 def _velocities(articulation: Articulation, sequence: MotionSequence) -> Float[Tensor, "T V"]:
@@ -90,15 +167,21 @@ def _decay(articulation: Articulation, sequences: Sequence[MotionSequence]) -> F
 
 
 def squared_accelerations(
-    articulation: Articulation, sequences: Sequence[MotionSequence], decay: Tensor
+    articulation: Articulation,
+    sequences: Sequence[MotionSequence],
+    decay: Float[Tensor, " V"],
+    drift: Float[Tensor, "V D"],
 ) -> Float[Tensor, " V"]:
-    """Return the squares of the accelerations of a set."""
-    changes = _accelerations(articulation, sequences, decay)
+    """Return the squares of the accelerations of a set that their mean leaves."""
+    changes = _accelerations(articulation, sequences, decay, drift)
     return changes.square().mean(0).clamp_min(_LEAST_ACCELERATION**2)
 
 
 def fit_correlation(
-    articulation: Articulation, sets: MotionSets, decay: Float[Tensor, " V"]
+    articulation: Articulation,
+    sets: MotionSets,
+    decay: Float[Tensor, " V"],
+    drift: Float[Tensor, "V D"],
 ) -> Float[Tensor, "V V"]:
     """Return how accelerations of angles correlate, those of mirrored bodies among them, mean over the sets.
 
@@ -106,14 +189,14 @@ def fit_correlation(
     sides have none in it.
 
     Args:
-        articulation: of the bodies. sets: recordings. decay: of the velocities.
+        articulation: of the bodies. sets: recordings. decay: of the velocities. drift: of `fit_drift`.
     """
     mirror = mirror_of(articulation)
     found = torch.zeros(len(decay), len(decay), dtype=torch.float64)
     for own in sets.values():
         told = known_columns(articulation, own)[3:]
         told = (told & told[mirror.columns]).double()
-        changes = _accelerations(articulation, own, decay)[:, 3:]
+        changes = _accelerations(articulation, own, decay, drift)[:, 3:]
         cov = changes.mT @ changes
         cov = cov + cov[mirror.columns][:, mirror.columns] * torch.outer(mirror.sign, mirror.sign)
         size = cov.diagonal().sqrt().clamp_min(_LEAST_ACCELERATION)
@@ -123,16 +206,30 @@ def fit_correlation(
 
 
 def _accelerations(
-    articulation: Articulation, sequences: Sequence[MotionSequence], decay: Tensor
+    articulation: Articulation,
+    sequences: Sequence[MotionSequence],
+    decay: Float[Tensor, " V"],
+    drift: Float[Tensor, "V D"],
 ) -> Float[Tensor, "T V"]:
-    """Return the accelerations between frames of a set, per root of a second."""
+    """Return the accelerations of a set in the lag after frames, less their mean, per root of a second.
+
+    Frame by frame, mean velocities of an Ornstein-Uhlenbeck process have, with x = decay h and e = exp(-x),
+
+        E[v_t^2] = q^2 / decay (x - 1 + e) / x^2,   E[v_t v_(t + k)] = q^2 / (2 decay) (1 - e)^2 / x^2 e^(k - 1).
+
+    Over a lag of several frames errors of recordings count less than in the change from one to the next.
+    """
     changes = []
     for sequence in sequences:
-        v = _velocities(articulation, sequence)
+        lag = _drift_lag(sequence.fps)
+        state, rate = _changes(articulation, sequence, decay)
         x = decay / sequence.fps
-        kept = torch.exp(-x)
-        share = (2 * (x - 1 + kept) - (1 - kept).square()) / (decay * x.square())
-        changes.append((v[1:] - v[:-1]) / share.sqrt())
+        kept, over = torch.exp(-x), torch.exp(-x * lag)
+        variance = (x - 1 + kept) / (decay * x.square())
+        later = (1 - kept).square() * torch.exp(-x * (lag - 1)) / (2 * decay * x.square())
+        share = variance * (1 + over.square()) - 2 * over * later
+        left = (rate - state @ drift.mT) * ((1 - over) / decay)
+        changes.append(left / share.sqrt())
     return torch.cat(clipped(changes))
 
 
@@ -149,8 +246,8 @@ def _alike(articulation: Articulation, values: Float[Tensor, " V"]) -> Tensor:
 
 def fit_shifts(
     articulation: Articulation, sets: MotionSets, least: float
-) -> tuple[Float[Tensor, " S"], Float[Tensor, "1"]]:
-    """Return the deviation of joints from rigid parts, along each axis, and its correlation time."""
+) -> tuple[Float[Tensor, " S"], Float[Tensor, " S"]]:
+    """Return the deviation of joints from rigid parts, along each axis, and the correlation time of each."""
     variances, later, told = [], [], []
     for own in sets.values():
         residuals = [r.flatten(1) for r in clipped([s.residual.flatten(1) for s in own])]
@@ -161,27 +258,27 @@ def fit_shifts(
         later.append(torch.cat(pairs).mean(0).unflatten(0, (-1, 3)).mean(-1))
         told.append(known)
     known = torch.stack(told)
-    variance, product = (_mean_of_known(torch.stack(v), known) for v in (variances, later))
+    variance, change = (_mean_of_known(torch.stack(v), known) for v in (variances, later))
     names = [articulation.skeleton.names[j] for j in articulation.shifted]
     other = [names.index(other_side(name)) for name in names]
-    variance = (variance + variance[other]) / 2
-    return variance.sqrt().clamp_min(least), _time(float(variance.sum()), float(product.sum()))
+    variance, change = (variance + variance[other]) / 2, (change + change[other]) / 2
+    return variance.sqrt().clamp_min(least), _times(variance, change)
 
 
 def _lagged(residual: Float[Tensor, "T C"], fps: float) -> Float[Tensor, "_ C"]:
-    """Return products of residuals with those a lag later; with the last one where there are not so many."""
+    """Return squares of the changes of residuals in a lag; with the last one where there are not so many."""
     lag = min(max(1, round(_SHIFT_LAG * fps)), len(residual) - 1)
-    return residual[:-lag] * residual[lag:]
+    return (residual[lag:] - residual[:-lag]).square()
 
 
 def _mean_of_known(values: Tensor, known: Tensor) -> Tensor:
     return torch.where(known, values, 0).sum(0) / known.sum(0).clamp_min(1)
 
 
-def _time(variance: float, product: float) -> Float[Tensor, "1"]:
-    """Return the time after which a correlation has fallen to 1/e, from that after the lag."""
-    seconds = _USUAL_SHIFT_TIME
-    if variance > _RIGID**2:
-        share = min(max(product / variance, 1e-6), 1 - 1e-6)
-        seconds = min(max(-_SHIFT_LAG / math.log(share), _SHIFT_TIMES[0]), _SHIFT_TIMES[1])
-    return torch.tensor([seconds], dtype=torch.float64)
+def _times(
+    variance: Float[Tensor, " S"], change: Float[Tensor, " S"]
+) -> Float[Tensor, " S"]:
+    """Return times after which correlations have fallen to 1/e, from mean squares of changes in the lag."""
+    share = (1 - change / (2 * variance).clamp_min(_RIGID**2)).clamp(1e-6, 1 - 1e-6)
+    seconds = (-_SHIFT_LAG / share.log()).clamp(*_SHIFT_TIMES)
+    return torch.where(variance > _RIGID**2, seconds, _USUAL_SHIFT_TIME)

@@ -44,15 +44,15 @@ class BodyMotionInfo:
 
 _KIND = FileKind(
     "torchpose-body-motion",
-    2,
+    3,
     BodyMotionInfo,
-    older=(1,),
+    older=(1, 2),
     tensors={
-        "acceleration": "V", "correlation": "V V", "decay": "V", "shift_std": "S", "shift_time": "1",
-        "pull_time": "1", "scale_mean": "G", "scale_cov": "G G", "weights": "K", "means": "K Q",
+        "acceleration": "V", "correlation": "V V", "decay": "V", "drift": "V D", "shift_std": "S",
+        "shift_time": "T", "pull_time": "1", "scale_mean": "G", "scale_cov": "G G", "weights": "K", "means": "K Q",
         "covariances": "K Q Q",
     },
-    newer=("correlation",),
+    newer=("correlation", "drift"),
     positive=("acceleration", "decay", "shift_std", "shift_time", "pull_time", "weights"),
     covariances=("correlation", "scale_cov", "covariances"),
 )  # fmt: skip
@@ -69,9 +69,10 @@ class BodyMotion(nn.Module):
     """Holds a prior over the motion, poses and proportions of articulated bodies.
 
     - Velocities v of root and angles are Ornstein-Uhlenbeck processes, dv = -decay v dt + acceleration dW,
-      where the Wiener processes W are correlated: the trunk stays where the pelvis turns, and feet do.
+      where the Wiener processes W are correlated: the trunk stays where the pelvis turns, and feet do. On
+      top of it they accelerate on average by `drift`, a linear function of pose and velocities.
     - Joints of the trunk shift from where a rigid part has them, as processes about zero with the standard
-      deviation `shift_std` and the time `shift_time`.
+      deviation `shift_std` and the time `shift_time` of each, or of all.
     - Angles of all parts but the root have a mixture of Gaussians as density, towards which they tend within
       the time `pull_time` where nothing is measured.
     - Logarithms of bone lengths over the standard ones have the mean `scale_mean` and covariance `scale_cov`
@@ -79,10 +80,12 @@ class BodyMotion(nn.Module):
 
     Args:
         acceleration: [3 + R], m or rad per s^1.5. decay: [3 + R], 1/s.
-        shift_std: [S], metres, along each axis. shift_time, pull_time: seconds.
+        shift_std: [S], metres, along each axis. shift_time: [S], or [1] of all, seconds. pull_time: seconds.
         scale_mean: [G]. scale_cov: [G, G]. poses: mixture over the Q `relative_angles` of `Articulation`.
         info: facts about the fit. articulation: of the bodies.
         correlation: [3 + R, 3 + R], of the accelerations; None is none.
+        drift: [3 + R, 1 + Q + 3 + R], of mean accelerations by 1, the Q `relative_angles` and the velocities,
+            where position is in the root's axes; None is none.
 
     Raises:
         ShapeError: sizes other than the articulation's. PriorError: what must be positive is not.
@@ -92,6 +95,7 @@ class BodyMotion(nn.Module):
     acceleration: Tensor
     correlation: Tensor
     decay: Tensor
+    drift: Tensor
     shift_std: Tensor
     shift_time: Tensor
     pull_time: Tensor
@@ -103,7 +107,7 @@ class BodyMotion(nn.Module):
         acceleration: Float[Tensor, " V"],
         decay: Float[Tensor, " V"],
         shift_std: Float[Tensor, " S"],
-        shift_time: Float[Tensor, "1"],
+        shift_time: Float[Tensor, " T"],
         pull_time: Float[Tensor, "1"],
         scale_mean: Float[Tensor, " G"],
         scale_cov: Float[Tensor, "G G"],
@@ -111,6 +115,7 @@ class BodyMotion(nn.Module):
         info: BodyMotionInfo | None = None,
         articulation: Articulation | None = None,
         correlation: Float[Tensor, "V V"] | None = None,
+        drift: Float[Tensor, "V D"] | None = None,
     ) -> None:
         super().__init__()
         self.articulation = articulation or Articulation()
@@ -120,9 +125,14 @@ class BodyMotion(nn.Module):
         check_shape("correlation", correlation, [body.n_pose, body.n_pose])
         check_covariance("correlation", correlation)
         columns = body.relative_columns
+        n_moving = 1 + columns.stop - columns.start + body.n_pose
+        if drift is None:
+            drift = torch.zeros(body.n_pose, n_moving).to(acceleration)
+        check_shape("drift", drift, [body.n_pose, n_moving])
         check_shape("acceleration", acceleration, [body.n_pose])
         check_shape("decay", decay, [body.n_pose])
         check_shape("shift_std", shift_std, [len(body.shifted)])
+        check_shape("shift_time", shift_time, [1 if len(shift_time) == 1 else len(body.shifted)])
         check_shape("scale_mean", scale_mean, [len(body.groups)])
         check_shape("scale_cov", scale_cov, [len(body.groups), len(body.groups)])
         check_shape("means", poses.means, [None, columns.stop - columns.start])
@@ -135,6 +145,7 @@ class BodyMotion(nn.Module):
                 raise PriorError(f"{name} must be positive, got {value.tolist()}")
             register_given(self, name, value.double())
         register_given(self, "correlation", correlation.double())
+        register_given(self, "drift", drift.double())
         register_given(self, "scale_mean", scale_mean.double())
         register_given(self, "scale_cov", scale_cov.double())
         self.poses, self.info = poses, info or BodyMotionInfo()

@@ -1,7 +1,7 @@
 """Filter the state of an articulated body from keypoints by an iterated extended Kalman filter.
 
 Prediction: position and angles go on with velocities that decay (an Ornstein-Uhlenbeck process), but hardly
-across the room while nothing is measured. Bone scales are nearly constant, shifts of joints decay to zero
+across the room while nothing is measured, and with mean accelerations by pose and velocity. Bone scales are nearly constant, shifts of joints decay to zero
 (`body_transition`). A pose prior pulls angles with the share dt / T of its information, so that alone it
 would decide about them within its time T.
 
@@ -234,8 +234,8 @@ class BodyKalmanFilter(nn.Module):
             state: of a frame. coasting: of whom nothing was measured in it; of nobody if None.
         """
         model = self.transition if coasting is None else self.transition_of(coasting)
-        mean = self.articulation.moved(state.mean, model.step(self.articulation, state.mean))
-        cov = model.matrix @ state.cov @ model.matrix.mT + model.noise
+        mean, matrix = model.ahead(self.motion, state.mean)
+        cov = matrix @ state.cov @ matrix.mT + model.noise
         log_odds, doubt = model.next_log_odds(state.log_odds), model.next_doubt(state.doubt)
         later = state._replace(mean=mean, cov=cov, log_odds=log_odds, doubt=doubt)
         return self.pulled(later, model.share)

@@ -93,9 +93,9 @@ def _gains(
         filter: that filtered. filtered: posteriors. widened, started: of the frames after these.
             coasting: of these.
     """
-    model, body = filter.transition_of(coasting), filter.articulation
-    ahead = body.moved(filtered.mean, model.step(body, filtered.mean))
-    carried = model.matrix @ filtered.cov
-    predicted = carried @ model.matrix.mT + model.noise + torch.diag_embed(widened)
+    model = filter.transition_of(coasting)
+    ahead, matrix = model.ahead(filter.motion, filtered.mean)
+    carried = matrix @ filtered.cov
+    predicted = carried @ matrix.mT + model.noise + torch.diag_embed(widened)
     gains = torch.cholesky_solve(carried, safe_cholesky(predicted)).mT
     return ahead, predicted, gains * ~started[..., None, None]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.priors._motion_drift import drift_at
 
 _SCALE_DRIFT = 0.002  # of the log of a bone's length, per root of a second
 _EXCHANGES = 0.1  # per second and camera, sides begin to be exchanged
@@ -21,24 +22,41 @@ _ROOT_JUMP = 1.0  # metres per second
 _KEPT = 0.1  # 1/s, decay of the root's horizontal velocity while nothing is measured
 
 
+class Ahead(NamedTuple):
+    """Holds bodies [*batch] one frame later, and the derivative [*batch, N, N] by their tangents before it."""
+
+    mean: BodyPoint
+    matrix: Tensor
+
+
 class BodyTransition(NamedTuple):
     """Holds the model of one frame.
 
     Attributes:
         matrix, noise: [N, N], or of each body [*batch, N, N], of the tangent.
+        driven: [N, V], or of each body, how far accelerations that last for the frame move the tangent.
         share: of the pose prior's information that a frame adds.
         begin, end: probabilities that an exchange of sides begins, and ends. lost: that a joint is.
     """
 
     matrix: Tensor
     noise: Tensor
+    driven: Tensor
     share: float
     begin: float
     end: float
     lost: float
 
-    def step(self, articulation: Articulation, point: BodyPoint) -> Float[Tensor, "*batch N"]:
-        """Return the step of the mean in the tangent space."""
+    def ahead(self, motion: BodyMotion, point: BodyPoint) -> Ahead:
+        """Return bodies one frame later, and how changes of them go on."""
+        body = motion.articulation
+        drift = drift_at(body, motion.drift, point)
+        driven = (self.driven @ drift.acceleration[..., None]).squeeze(-1)
+        matrix = self.matrix + self.driven @ drift.jacobian
+        return Ahead(body.moved(point, self._step(body, point) + driven), matrix)
+
+    def _step(self, articulation: Articulation, point: BodyPoint) -> Float[Tensor, "*batch N"]:
+        """Return the step of the mean in the tangent space without mean accelerations."""
         at = articulation.columns
         moving = point.velocity.new_zeros(*point.velocity.shape[:-1], articulation.dim)
         moving[..., at["velocity"]] = point.velocity
@@ -51,7 +69,9 @@ class BodyTransition(NamedTuple):
         """Return the model of each body, another one for those of whom nothing was measured."""
         rows = coasting[..., None, None]
         matrix = torch.where(rows, other.matrix, self.matrix)
-        return self._replace(matrix=matrix, noise=torch.where(rows, other.noise, self.noise))
+        noise = torch.where(rows, other.noise, self.noise)
+        driven = torch.where(rows, other.driven, self.driven)
+        return self._replace(matrix=matrix, noise=noise, driven=driven)
 
     def next_log_odds(self, log_odds: Float[Tensor, "*batch C 2"]) -> Float[Tensor, "*batch C 2"]:
         """Return the log-odds of exchanged sides one frame later."""
@@ -74,6 +94,8 @@ def transition(
 
         Q_ij [(dt - b_i - b_j + c) / (decay_i decay_j),  (b_j - c) / decay_i;  (b_i - c) / decay_j,  c].
 
+    Mean accelerations u add (dt - b) / decay u to x', and b u to v'.
+
     Args:
         motion: how bodies move. dt: seconds. decay: 1/s, of other velocities than the motion's.
     """
@@ -94,15 +116,18 @@ def transition(
     noise[: body.n_pose, : body.n_pose] = both
     noise[: body.n_pose, at["velocity"]], noise[at["velocity"], : body.n_pose] = across, across.mT
     noise[at["velocity"], at["velocity"]] = power * together
+    driven = matrix.new_zeros(body.dim, body.n_pose)
+    driven[pose, pose], driven[velocity, pose] = (dt - gone) / decay, gone
     shifts = _index(at["shifts"])
-    held = torch.exp(-dt / motion.shift_time)
-    matrix[shifts, shifts] = held
-    noise[shifts, shifts] = motion.shift_std.repeat_interleave(3).square() * (1 - held.square())
+    held = torch.exp(-dt / motion.shift_time).expand_as(motion.shift_std)
+    spread = motion.shift_std.square() * (1 - held.square())
+    matrix[shifts, shifts] = held.repeat_interleave(3)
+    noise[shifts, shifts] = spread.repeat_interleave(3)
     scales = _index(at["scales"])
     noise[scales, scales] = _SCALE_DRIFT**2 * dt
     begin, end, lost = (1 - math.exp(-rate * dt) for rate in (_EXCHANGES, _RETURNS, _LOST))
     share = dt / float(motion.pull_time)
-    return BodyTransition(matrix, noise, share, begin, end, lost)
+    return BodyTransition(matrix, noise, driven, share, begin, end, lost)
 
 
 def coasting_transition(motion: BodyMotion, dt: float, up: Float[Tensor, "3"]) -> BodyTransition:
@@ -124,7 +149,9 @@ def coasting_transition(motion: BodyMotion, dt: float, up: Float[Tensor, "3"]) -
         return kept
 
     matrix, noise = mixed(usual.matrix, kept.matrix), mixed(usual.noise, kept.noise)
-    return usual._replace(matrix=matrix, noise=noise)
+    driven = usual.driven.clone()
+    driven[:, :3] = 0  # mean accelerations would stop who goes on unseen as well
+    return usual._replace(matrix=matrix, noise=noise, driven=driven)
 
 
 def jump_variance(motion: BodyMotion) -> Float[Tensor, " N"]:
