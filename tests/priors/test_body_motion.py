@@ -38,14 +38,19 @@ def test_a_file_brings_it_back(tmp_path):
         BodyMotion.load(path)
 
 
-def test_an_older_file_has_no_correlation(tmp_path):
+def test_older_files_have_no_correlation_and_no_drift(tmp_path):
     motion, path = some_body_motion(), tmp_path / "old.safetensors"
+    lacking = ("correlation", "drift")
     given = {
-        n: getattr(motion, n) for n in _KIND.tensors if n != "correlation" and hasattr(motion, n)
+        n: getattr(motion, n) for n in _KIND.tensors if n not in lacking and hasattr(motion, n)
     }
     given |= {n: getattr(motion.poses, n) for n in ("weights", "means", "covariances")}
     write_tensors(path, replace(_KIND, version=1), motion.info, given)
     assert bool((BodyMotion.load(path).correlation == torch.eye(27).double()).all())
+    given["correlation"] = torch.eye(27).double()
+    write_tensors(path, replace(_KIND, version=2), motion.info, given)
+    assert not BodyMotion.load(path).drift.any()
+    del given["correlation"]
     write_tensors(path, _KIND, motion.info, given)
     with pytest.raises(FileFormatError, match=r"expected the tensors .*correlation"):
         BodyMotion.load(path)
@@ -71,6 +76,8 @@ def test_the_shipped_one_is_of_the_body_that_is_tracked():
         ({"decay": torch.zeros(27).double()}, PriorError, "decay must be positive"),
         ({"acceleration": torch.ones(3).double()}, ShapeError, "acceleration"),
         ({"correlation": torch.eye(3).double()}, ShapeError, "correlation"),
+        ({"drift": torch.zeros(27, 48).double()}, ShapeError, "drift"),
+        ({"shift_time": torch.ones(3).double()}, ShapeError, "shift_time"),
         ({"correlation": -torch.eye(27).double()}, CovarianceError, "correlation"),
         ({"shift_std": torch.ones(9).double()}, ShapeError, "shift_std"),
         ({"scale_cov": torch.eye(2).double()}, ShapeError, "scale_cov"),

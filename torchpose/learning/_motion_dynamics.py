@@ -1,6 +1,5 @@
 """Fit how fast recorded bodies move and turn, and how far joints of the trunk shift, to `BodyMotion`."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -22,7 +21,9 @@ from torchpose.priors._motion_drift import moving
 _NEAR, _FAR = 1 / 30, 1 / 15  # seconds, lags between which velocities tell their decay
 _DECAYS = (0.3, 15.0)  # per second
 _DRIFT_LAG = 0.1  # seconds after which velocities tell mean accelerations, and what is left of them
-_SHRUNK = 0.03  # information that there are no mean accelerations, in deviations of what they depend on
+_SHRUNK = (
+    0.03  # information that there are no mean accelerations, in deviations of what they depend on
+)
 _LEAST_DEVIATION = 0.01  # radians, metres and radians per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5
 _CORRELATED = 0.9  # share of the correlations that other recordings are expected to have
@@ -51,7 +52,7 @@ def _lags(fps: float) -> tuple[int, int]:
 
 
 def fit_decay(articulation: Articulation, sets: MotionSets) -> Float[Tensor, " V"]:
-    """Return the decay [V] of the velocities of position and angles: E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
+    """Return the decay of the velocities of position and angles, E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
     told = torch.stack([known_columns(articulation, own) for own in sets.values()])
     decays = torch.stack([_decay(articulation, own) for own in sets.values()])
     return _alike(articulation, _geometric_mean(decays, told))
@@ -215,7 +216,8 @@ def _accelerations(
 
     Frame by frame, mean velocities of an Ornstein-Uhlenbeck process have, with x = decay h and e = exp(-x),
 
-        E[v_t^2] = q^2 / decay (x - 1 + e) / x^2,   E[v_t v_(t + k)] = q^2 / (2 decay) (1 - e)^2 / x^2 e^(k - 1).
+        E[v_t^2] = q^2 / decay (x - 1 + e) / x^2,
+        E[v_t v_(t + k)] = q^2 / (2 decay) (1 - e)^2 / x^2 e^(k - 1),   k > 0.
 
     Over a lag of several frames errors of recordings count less than in the change from one to the next.
     """
@@ -275,9 +277,7 @@ def _mean_of_known(values: Tensor, known: Tensor) -> Tensor:
     return torch.where(known, values, 0).sum(0) / known.sum(0).clamp_min(1)
 
 
-def _times(
-    variance: Float[Tensor, " S"], change: Float[Tensor, " S"]
-) -> Float[Tensor, " S"]:
+def _times(variance: Float[Tensor, " S"], change: Float[Tensor, " S"]) -> Float[Tensor, " S"]:
     """Return times after which correlations have fallen to 1/e, from mean squares of changes in the lag."""
     share = (1 - change / (2 * variance).clamp_min(_RIGID**2)).clamp(1e-6, 1 - 1e-6)
     seconds = (-_SHIFT_LAG / share.log()).clamp(*_SHIFT_TIMES)

@@ -49,8 +49,8 @@ _KIND = FileKind(
     older=(1, 2),
     tensors={
         "acceleration": "V", "correlation": "V V", "decay": "V", "drift": "V D", "shift_std": "S",
-        "shift_time": "T", "pull_time": "1", "scale_mean": "G", "scale_cov": "G G", "weights": "K", "means": "K Q",
-        "covariances": "K Q Q",
+        "shift_time": "T", "pull_time": "1", "scale_mean": "G", "scale_cov": "G G", "weights": "K",
+        "means": "K Q", "covariances": "K Q Q",
     },
     newer=("correlation", "drift"),
     positive=("acceleration", "decay", "shift_std", "shift_time", "pull_time", "weights"),

@@ -19,7 +19,7 @@ from torchpose.math._rotations import cross_matrix
 
 
 class Drift(NamedTuple):
-    """Holds mean accelerations [*batch, V] in world axes, and their derivative [*batch, V, N] by the tangent."""
+    """Holds mean accelerations [*batch, V], world axes, and their derivative [*batch, V, N] by the tangent."""
 
     acceleration: Tensor
     jacobian: Tensor
@@ -38,9 +38,7 @@ def moving(
     return torch.cat([one, articulation.relative_angles(point), own, velocity[..., 3:]], -1)
 
 
-def drift_at(
-    articulation: Articulation, drift: Float[Tensor, "V D"], point: BodyPoint
-) -> Drift:
+def drift_at(articulation: Articulation, drift: Float[Tensor, "V D"], point: BodyPoint) -> Drift:
     """Return the mean accelerations of bodies beside the decay of their velocities.
 
     A small turn d of the root changes v by [v]_x d, and accelerations R u by -R [u]_x d. Angles are taken to

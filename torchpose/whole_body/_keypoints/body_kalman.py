@@ -1,9 +1,9 @@
 """Filter the state of an articulated body from keypoints by an iterated extended Kalman filter.
 
 Prediction: position and angles go on with velocities that decay (an Ornstein-Uhlenbeck process), but hardly
-across the room while nothing is measured, and with mean accelerations by pose and velocity. Bone scales are nearly constant, shifts of joints decay to zero
-(`body_transition`). A pose prior pulls angles with the share dt / T of its information, so that alone it
-would decide about them within its time T.
+across the room while nothing is measured, and with mean accelerations by pose and velocity. Bone scales are
+nearly constant, shifts of joints decay to zero (`body_transition`). A pose prior pulls angles with the share
+dt / T of its information, so that alone it would decide about them within its time T.
 
 Correction, iterated at x_i with d = x_i - x_predicted in the tangent space:
 

@@ -23,7 +23,7 @@ _KEPT = 0.1  # 1/s, decay of the root's horizontal velocity while nothing is mea
 
 
 class Ahead(NamedTuple):
-    """Holds bodies [*batch] one frame later, and the derivative [*batch, N, N] by their tangents before it."""
+    """Holds bodies [*batch] one frame later, and their derivative [*batch, N, N] by the tangents before."""
 
     mean: BodyPoint
     matrix: Tensor
