@@ -52,7 +52,7 @@ def _lags(fps: float) -> tuple[int, int]:
 
 
 def fit_decay(articulation: Articulation, sets: MotionSets) -> Float[Tensor, " V"]:
-    """Return the decay of the velocities of position and angles, E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
+    """Return the decay of the velocities, E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
     told = torch.stack([known_columns(articulation, own) for own in sets.values()])
     decays = torch.stack([_decay(articulation, own) for own in sets.values()])
     return _alike(articulation, _geometric_mean(decays, told))

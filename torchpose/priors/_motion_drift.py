@@ -19,7 +19,7 @@ from torchpose.math._rotations import cross_matrix
 
 
 class Drift(NamedTuple):
-    """Holds mean accelerations [*batch, V], world axes, and their derivative [*batch, V, N] by the tangent."""
+    """Holds mean accelerations [*batch, V], world axes, and their derivative [*batch, V, N]."""
 
     acceleration: Tensor
     jacobian: Tensor
