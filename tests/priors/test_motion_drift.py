@@ -66,9 +66,9 @@ def test_a_frame_follows_it():
 
 
 def test_whom_nobody_sees_comes_to_rest():
-    """While nothing is measured, no motion of the shipped prior grows, even without the pull of poses.
+    """Nothing drives whom nobody sees; of others no motion becomes three times as large in half a minute.
 
-    While something is, what grows would take longer than half a minute to become three times as large.
+    That is without the pull of poses.
     """
     motion = load_body_motion("whole-body")
     body, up = motion.articulation, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
@@ -83,5 +83,5 @@ def test_whom_nobody_sees_comes_to_rest():
     ):
         matrix = model.ahead(motion, rest).matrix[..., rows, :][..., rows]
         growth[name] = float(torch.linalg.eigvals(matrix).abs().max().log()) / 0.02
-    assert growth["unseen"] < 0
+    assert growth["unseen"] < 1e-9
     assert growth["seen"] < 1 / 30

@@ -489,7 +489,7 @@ def test_hips_that_no_camera_sees_go_along_with_who_walks():
     keypoints[:, :, HIPS + legs] = math.nan
     found = tracker(given.rig)(keypoints=keypoints)
     off = (found.joints3d - joints)[20:, HIPS]
-    assert float(off[..., [0, 2]].norm(dim=-1).mean()) < 0.02  # across the room
+    assert float(off[..., [0, 2]].norm(dim=-1).mean()) < 0.025  # across the room
     assert float(off.norm(dim=-1).mean()) < 0.07  # the trunk has the usual length
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchpose
+from tests.priors.motions import some_body_motion
 from tests.whole_body.keypoints.scenes import ring, scene
 from torchpose.body import BODY_15, Body
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -163,12 +164,15 @@ def test_a_prediction_in_two_halves_is_one(motion, coasting):
     torch.testing.assert_close(noise, whole.noise, rtol=1e-8, atol=1e-14)
 
 
-def test_only_the_horizontal_motion_of_whom_nobody_sees_goes_on(motion):
+def test_only_the_horizontal_motion_of_whom_nobody_sees_goes_on():
+    motion = some_body_motion()
     body = motion.articulation
     point = random_point(body)._replace(velocity=torch.ones(2, body.n_pose).double())
     filter = BodyKalmanFilter(motion, ring(2), 30.0, up="y")
-    usual = filter.transition.step(body, point)
-    seen, unseen = filter.transition_of(torch.tensor([False, True])).step(body, point)
+    model = filter.transition_of(torch.tensor([False, True]))
+    usual, (seen, unseen) = (
+        body.difference(one.ahead(motion, point).mean, point) for one in (filter.transition, model)
+    )
     torch.testing.assert_close(seen, usual[0])
     x, y, z = unseen[body.columns["position"]]
     assert float(x) == pytest.approx(1 / 30, rel=0.01) and float(z) == pytest.approx(float(x))
@@ -177,6 +181,7 @@ def test_only_the_horizontal_motion_of_whom_nobody_sees_goes_on(motion):
     rest[body.columns["position"]] = rest[body.columns["velocity"]] = False
     torch.testing.assert_close(unseen[rest], usual[1, rest])
     assert float(y) == pytest.approx(float(usual[1, 1]))
+    assert model.driven[0].any() and not model.driven[1].any()
 
 
 def test_a_usual_trunk_is_the_prior_given_what_is_usual():

@@ -135,7 +135,7 @@ def coasting_transition(motion: BodyMotion, dt: float, up: Float[Tensor, "3"]) -
 
     The decay of the root's velocity that recordings tell is of all its motion, and most of that goes to and
     fro. By it who walks on unseen would stay behind by a metre in a second. Here the horizontal part, across
-    `up`, hardly decays.
+    `up`, hardly decays. Nothing has a mean acceleration, since a pose that is imagined tells none.
     """
     at, decay = motion.articulation.columns, motion.decay.clone()
     decay[:3] = _KEPT
@@ -149,9 +149,8 @@ def coasting_transition(motion: BodyMotion, dt: float, up: Float[Tensor, "3"]) -
         return kept
 
     matrix, noise = mixed(usual.matrix, kept.matrix), mixed(usual.noise, kept.noise)
-    driven = usual.driven.clone()
-    driven[:, :3] = 0  # mean accelerations would stop who goes on unseen as well
-    return usual._replace(matrix=matrix, noise=noise, driven=driven)
+    undriven = torch.zeros_like(usual.driven)
+    return usual._replace(matrix=matrix, noise=noise, driven=undriven)
 
 
 def jump_variance(motion: BodyMotion) -> Float[Tensor, " N"]:
