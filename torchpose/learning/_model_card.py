@@ -348,9 +348,9 @@ def _body_motion(motion: Any, call: str) -> _Told:
     settings = info.extra.get("settings", {})
     n_poses = len(motion.poses.weights)
     what = (
-        "How fast position and angles of a body accelerate, how they do on average by pose and velocity, how "
-        "the rest of these accelerations correlates, and how velocities decay (Ornstein-Uhlenbeck processes), "
-        "how far neck, shoulders and hips shift from rigid "
+        "How fast position and angles of a body accelerate, how they do on average by pose and velocity, "
+        "how the rest of these accelerations correlates, and how velocities decay (Ornstein-Uhlenbeck "
+        "processes), how far neck, shoulders and hips shift from rigid "
         f"parts, mean and covariance of the logarithms of bone lengths, and a mixture of {n_poses} Gaussians "
         "over the angles of all parts, half of them mirror images of the others. The Kalman filter over "
         "bodies from keypoints uses it. Every set of recordings counts alike, except that poses have shares "
