@@ -15,13 +15,14 @@ from torch import Tensor
 from torchpose.body._articulation import Articulation, mirror_of
 from torchpose.errors import InputError
 from torchpose.learning._motion_dynamics import (
+    accelerations_left,
     fit_accelerations,
     fit_correlation,
     fit_decay,
     fit_drift,
     fit_shifts,
     long_enough,
-    squared_accelerations,
+    mean_squares,
 )
 from torchpose.learning._motion_sequences import (
     MotionSequence,
@@ -92,7 +93,8 @@ def fit_body_motion(
     _check_joints(articulation, sets)
     decay = fit_decay(articulation, sets)
     drift = fit_drift(articulation, sets, decay)
-    acceleration = fit_accelerations(articulation, sets, decay, drift)
+    left = [accelerations_left(articulation, own, decay, drift) for own in sets.values()]
+    acceleration = fit_accelerations(articulation, sets, left)
     shift_std, shift_time = fit_shifts(articulation, sets, recipe.least_shift)
     scale_mean, scale_cov = _fit_scales(articulation, sets)
     return BodyMotion(
@@ -105,7 +107,7 @@ def fit_body_motion(
         scale_cov,
         _fit_poses(articulation, sets, recipe),
         articulation=articulation,
-        correlation=fit_correlation(articulation, sets, decay, drift),
+        correlation=fit_correlation(articulation, sets, left),
         drift=drift,
     )
 
@@ -278,8 +280,8 @@ def acceleration_ratio(motion: BodyMotion, sequences: Sequence[MotionSequence]) 
     body, sums, count = motion.articulation, 0.0, 0
     for own in by_origin(long_enough(sequences)).values():
         known = known_columns(body, own)
-        left = squared_accelerations(body, own, motion.decay, motion.drift)
-        power = left / motion.acceleration.square()
+        left = accelerations_left(body, own, motion.decay, motion.drift)
+        power = mean_squares(left) / motion.acceleration.square()
         sums, count = sums + float(power[known].sum()), count + int(known.sum())
     return math.sqrt(sums / count)
 

@@ -21,9 +21,7 @@ from torchpose.priors._motion_drift import moving
 _NEAR, _FAR = 1 / 30, 1 / 15  # seconds, lags between which velocities tell their decay
 _DECAYS = (0.3, 15.0)  # per second
 _DRIFT_LAG = 0.1  # seconds after which velocities tell mean accelerations, and what is left of them
-_SHRUNK = (
-    0.03  # information that there are no mean accelerations, in deviations of what they depend on
-)
+_SHRUNK = 0.03  # information that there are no mean accelerations, in standard deviations
 _LEAST_DEVIATION = 0.01  # radians, metres and radians per second
 _LEAST_ACCELERATION = 0.05  # metres or radians per s^1.5
 _CORRELATED = 0.9  # share of the correlations that other recordings are expected to have
@@ -53,9 +51,8 @@ def _lags(fps: float) -> tuple[int, int]:
 
 def fit_decay(articulation: Articulation, sets: MotionSets) -> Float[Tensor, " V"]:
     """Return the decay of the velocities, E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
-    told = torch.stack([known_columns(articulation, own) for own in sets.values()])
     decays = torch.stack([_decay(articulation, own) for own in sets.values()])
-    return _alike(articulation, _geometric_mean(decays, told))
+    return _alike(articulation, _geometric_mean(decays, _told(articulation, sets)))
 
 
 def fit_drift(
@@ -69,7 +66,7 @@ def fit_drift(
     Args:
         articulation: of the bodies. sets: recordings. decay: of the velocities.
     """
-    told = torch.stack([known_columns(articulation, own) for own in sets.values()]).double()
+    told = _told(articulation, sets).double()
     pairs = [_changes_of_set(articulation, own, decay) for own in sets.values()]
     means = torch.stack([x.mean(0) for x, _ in pairs]).mean(0)
     means[0] = 0.0
@@ -90,19 +87,15 @@ def fit_drift(
 
 
 def fit_accelerations(
-    articulation: Articulation,
-    sets: MotionSets,
-    decay: Float[Tensor, " V"],
-    drift: Float[Tensor, "V D"],
+    articulation: Articulation, sets: MotionSets, left: Sequence[Float[Tensor, "_ V"]]
 ) -> Float[Tensor, " V"]:
     """Return the accelerations of position and angles that their mean leaves.
 
     Args:
-        articulation: of the bodies. sets: recordings. decay: of the velocities. drift: of `fit_drift`.
+        articulation: of the bodies. sets: recordings. left: of each set (`accelerations_left`).
     """
-    told = torch.stack([known_columns(articulation, own) for own in sets.values()])
-    powers = [squared_accelerations(articulation, own, decay, drift) for own in sets.values()]
-    power = _geometric_mean(torch.stack(powers), told)
+    powers = torch.stack([mean_squares(changes) for changes in left])
+    power = _geometric_mean(powers, _told(articulation, sets))
     return _alike(articulation, power).sqrt().clamp_min(_LEAST_ACCELERATION)
 
 
@@ -167,22 +160,13 @@ def _decay(articulation: Articulation, sequences: Sequence[MotionSequence]) -> F
     return (-ratio.clamp(1e-12, 1.0).log() * (count / between)).clamp(*_DECAYS)
 
 
-def squared_accelerations(
-    articulation: Articulation,
-    sequences: Sequence[MotionSequence],
-    decay: Float[Tensor, " V"],
-    drift: Float[Tensor, "V D"],
-) -> Float[Tensor, " V"]:
-    """Return the squares of the accelerations of a set that their mean leaves."""
-    changes = _accelerations(articulation, sequences, decay, drift)
-    return changes.square().mean(0).clamp_min(_LEAST_ACCELERATION**2)
+def mean_squares(left: Float[Tensor, "T V"]) -> Float[Tensor, " V"]:
+    """Return the mean squares of accelerations that their mean leaves (`accelerations_left`)."""
+    return left.square().mean(0).clamp_min(_LEAST_ACCELERATION**2)
 
 
 def fit_correlation(
-    articulation: Articulation,
-    sets: MotionSets,
-    decay: Float[Tensor, " V"],
-    drift: Float[Tensor, "V D"],
+    articulation: Articulation, sets: MotionSets, left: Sequence[Float[Tensor, "_ V"]]
 ) -> Float[Tensor, "V V"]:
     """Return how accelerations of angles correlate, those of mirrored bodies among them, mean over the sets.
 
@@ -190,15 +174,13 @@ def fit_correlation(
     sides have none in it.
 
     Args:
-        articulation: of the bodies. sets: recordings. decay: of the velocities. drift: of `fit_drift`.
+        articulation: of the bodies. sets: recordings. left: of each set (`accelerations_left`).
     """
-    mirror = mirror_of(articulation)
-    found = torch.zeros(len(decay), len(decay), dtype=torch.float64)
-    for own in sets.values():
-        told = known_columns(articulation, own)[3:]
+    mirror, n = mirror_of(articulation), articulation.n_pose
+    found = torch.zeros(n, n, dtype=torch.float64)
+    for told, changes in zip(_told(articulation, sets)[:, 3:], left, strict=True):
         told = (told & told[mirror.columns]).double()
-        changes = _accelerations(articulation, own, decay, drift)[:, 3:]
-        cov = changes.mT @ changes
+        cov = changes[:, 3:].mT @ changes[:, 3:]
         cov = cov + cov[mirror.columns][:, mirror.columns] * torch.outer(mirror.sign, mirror.sign)
         size = cov.diagonal().sqrt().clamp_min(_LEAST_ACCELERATION)
         found[3:, 3:] += cov / torch.outer(size, size) * torch.outer(told, told) / len(sets)
@@ -206,7 +188,7 @@ def fit_correlation(
     return found.fill_diagonal_(1.0)
 
 
-def _accelerations(
+def accelerations_left(
     articulation: Articulation,
     sequences: Sequence[MotionSequence],
     decay: Float[Tensor, " V"],
@@ -220,6 +202,9 @@ def _accelerations(
         E[v_t v_(t + k)] = q^2 / (2 decay) (1 - e)^2 / x^2 e^(k - 1),   k > 0.
 
     Over a lag of several frames errors of recordings count less than in the change from one to the next.
+
+    Args:
+        articulation: of the bodies. sequences: of a set. decay: of the velocities. drift: of `fit_drift`.
     """
     changes = []
     for sequence in sequences:
@@ -233,6 +218,11 @@ def _accelerations(
         left = (rate - state @ drift.mT) * ((1 - over) / decay)
         changes.append(left / share.sqrt())
     return torch.cat(clipped(changes))
+
+
+def _told(articulation: Articulation, sets: MotionSets) -> Bool[Tensor, "K V"]:
+    """Return which columns of position and angles each set tells."""
+    return torch.stack([known_columns(articulation, own) for own in sets.values()])
 
 
 def _geometric_mean(values: Float[Tensor, "K V"], told: Bool[Tensor, "K V"]) -> Tensor:
@@ -250,24 +240,24 @@ def fit_shifts(
     articulation: Articulation, sets: MotionSets, least: float
 ) -> tuple[Float[Tensor, " S"], Float[Tensor, " S"]]:
     """Return the deviation of joints from rigid parts, along each axis, and the correlation time of each."""
-    variances, later, told = [], [], []
+    variances, changes, told = [], [], []
     for own in sets.values():
         residuals = [r.flatten(1) for r in clipped([s.residual.flatten(1) for s in own])]
         known = known_joints(own)[list(articulation.shifted)]
-        pairs = [_lagged(r, s.fps) for r, s in zip(residuals, own, strict=True)]
+        moved = [_moved(r, s.fps) for r, s in zip(residuals, own, strict=True)]
         squares = torch.cat(residuals).square().mean(0)
         variances.append(squares.unflatten(0, (-1, 3)).mean(-1))
-        later.append(torch.cat(pairs).mean(0).unflatten(0, (-1, 3)).mean(-1))
+        changes.append(torch.cat(moved).mean(0).unflatten(0, (-1, 3)).mean(-1))
         told.append(known)
     known = torch.stack(told)
-    variance, change = (_mean_of_known(torch.stack(v), known) for v in (variances, later))
+    variance, change = (_mean_of_known(torch.stack(v), known) for v in (variances, changes))
     names = [articulation.skeleton.names[j] for j in articulation.shifted]
     other = [names.index(other_side(name)) for name in names]
     variance, change = (variance + variance[other]) / 2, (change + change[other]) / 2
     return variance.sqrt().clamp_min(least), _times(variance, change)
 
 
-def _lagged(residual: Float[Tensor, "T C"], fps: float) -> Float[Tensor, "_ C"]:
+def _moved(residual: Float[Tensor, "T C"], fps: float) -> Float[Tensor, "_ C"]:
     """Return squares of the changes of residuals in a lag; with the last one where there are not so many."""
     lag = min(max(1, round(_SHIFT_LAG * fps)), len(residual) - 1)
     return (residual[lag:] - residual[:-lag]).square()
