@@ -11,6 +11,7 @@ def differences():
     return differences_of("tests.compiled_models")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_compiled_model_gives_the_numbers_of_the_plain_one(differences, case):
     assert differences[case] == 0

@@ -193,6 +193,7 @@ def test_missing_joints_are_left_out_and_nothing_at_all_is_an_error(scene) -> No
         viz.plot_pose_3d(torch.full((8, 3), torch.nan))
 
 
+@pytest.mark.slow
 def test_pictures_leave_global_settings_and_pyplot_alone() -> None:
     code = (
         "import sys; import torchpose, torchpose.viz as viz\n"

@@ -365,6 +365,7 @@ class Scored(Dataset):
             return self.tracker(points(index, 1, 5, 2)).mean
 
 
+@pytest.mark.slow
 def test_modules_go_to_worker_processes():
     data = Scored()
     here = torch.stack([data[i] for i in range(4)])

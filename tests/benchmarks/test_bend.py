@@ -173,6 +173,7 @@ def test_a_confusion_table_counts_recordings():
 # --- the whole of it ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_writes_tables_and_pictures(done):
     out, report = done
     assert {"particles", "tuning", "sequences"} <= set(report)
@@ -196,6 +197,7 @@ def test_a_run_writes_tables_and_pictures(done):
     assert occlusion["first order", "lost, 0 s"] > occlusion["first order", "near"]
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     out, report = done
     for path in sorted(out.glob("run-*.npz"))[:2]:
@@ -208,6 +210,7 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     assert str(again["dimensions"].rows) == str(report["dimensions"].rows)  # some are NaN
 
 
+@pytest.mark.slow
 def test_gates_of_other_dimensions_are_told_in_the_report(done, folder, tmp_path):
     found = bend.run(folder, tmp_path, part="particles", **SMALL, gate_dimensions=3)
     assert found.settings["dimensions of the gates"] == 3
@@ -239,6 +242,7 @@ def test_two_persons_are_too_few(tmp_path):
         bend.run(tmp_path / "two", tmp_path, part="particles", **SMALL)
 
 
+@pytest.mark.slow
 def test_the_command_recognises_actions(folder, tmp_path, capsys):
     from benchmarks._protocols import execute_protocol
 

@@ -30,6 +30,7 @@ def scene(tmp_path_factory):
     return home
 
 
+@pytest.mark.slow
 def test_everybody_unknown_is_tracked(scene, tmp_path):
     body_models.run(
         scene / "walks", tmp_path, quick=True, progress=False, size="80x60",

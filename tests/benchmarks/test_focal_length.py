@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.benchmarks.conftest import ROOT
 
 SMALL = "kinect-upper-body-small"  # a quarter of the time
@@ -24,6 +26,7 @@ def run(script: str, *options: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_the_true_focal_length_is_no_worse_than_a_wrong_one(few_people, tmp_path):
     written = tmp_path / "table.md"
     options = ("--data", str(few_people), "--out", str(written), "--prior", SMALL)

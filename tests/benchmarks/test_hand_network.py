@@ -126,6 +126,7 @@ def test_the_loss_is_least_at_the_label():
     assert float(_loss(gone, batch.places, batch.seen)) < 0.05 < loss(3, 3)
 
 
+@pytest.mark.slow
 def test_a_fit_is_a_network_that_is_ready_and_the_same_again(monkeypatch):
     monkeypatch.setattr(training, "BATCH", 4)
     hands = windows(2)

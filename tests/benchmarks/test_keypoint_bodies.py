@@ -192,6 +192,7 @@ def test_a_real_camera_is_predicted_from_the_others():
     assert 5 < float(errors.nanmedian()) < 30
 
 
+@pytest.mark.slow
 def test_quick_run_prints_every_peer(run_here, tmp_path):
     data = data_dir_or_skip("mocap_cmu_walk").parent
     for name in (ACTIONS, KINECT, OTHER_KINECT, MHAD, "multicam_pose2sim"):
@@ -228,6 +229,7 @@ def test_quick_run_prints_people_who_lie(run_here):
         assert f"| kalman *, {row} |" in printed
 
 
+@pytest.mark.slow
 def test_quick_run_prints_cameras_that_are_tilted(run_here):
     data = data_dir_or_skip(MHAD).parent
     options = ("--data", str(data), "--quick", "--uncalibrated", "--methods", "kalman")
@@ -237,6 +239,7 @@ def test_quick_run_prints_cameras_that_are_tilted(run_here):
     assert "Tilt found, persons of a Kinect" in printed
 
 
+@pytest.mark.slow
 def test_quick_run_prints_people_behind_a_desk(run_here):
     data = data_dir_or_skip(MHAD).parent
     for name in (WALKS, ACTIONS):
@@ -256,6 +259,7 @@ def test_turned_rings_see_the_same_body_from_other_sides(walker):
     torch.testing.assert_close(ahead.joints, beside.joints)
 
 
+@pytest.mark.slow
 def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_size(tmp_path):
     data = data_dir_or_skip(WALKS).parent
     data_dir_or_skip(KINECT)

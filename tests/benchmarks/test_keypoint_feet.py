@@ -66,6 +66,7 @@ def test_tracked_toes_are_nearer_than_those_of_a_fixed_foot(walk):
     assert_close(toe / shank, torch.full_like(toe, float((toe / shank)[0])))
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_prior_over_feet_is_fitted_and_read_back(tmp_path):
     data = data_dir_or_skip("mocap_cmu_walk").parent

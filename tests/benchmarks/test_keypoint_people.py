@@ -89,6 +89,7 @@ def test_measures_have_known_values(passing):
     assert math.isnan(score_people([], truth).error)
 
 
+@pytest.mark.slow
 def test_the_tracker_alone_and_together(passing):
     clip = passing[1].of_cameras(3)
     clip = clip._replace(

@@ -19,6 +19,7 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells[2:]}
 
 
+@pytest.mark.slow
 def test_landmarks_as_the_front_end(run_here, tmp_path):
     written = tmp_path / "table.md"
     data = data_dir_or_skip("video_asl").parent
@@ -34,6 +35,7 @@ def test_landmarks_as_the_front_end(run_here, tmp_path):
     assert {"interpolation", "all eight, filtered, elbow hidden too"} <= gaps.keys()
 
 
+@pytest.mark.slow
 def test_joints_from_video(run_here, tmp_path):
     written, pictures = tmp_path / "joints.md", tmp_path / "joints"
     data = data_dir_or_skip("video_asl").parent

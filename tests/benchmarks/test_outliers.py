@@ -46,6 +46,7 @@ def test_a_median_takes_a_single_outlier_out_and_keeps_what_is_missing():
     assert found[0, 2, 0, 0] == 2.0
 
 
+@pytest.mark.slow
 def test_it_runs_on_a_few_recordings(run_here, few_people, tmp_path, monkeypatch):
     data_dir_or_skip("kinect_utd_mhad")
     monkeypatch.setattr(outliers, "SIZES", (1e4,))

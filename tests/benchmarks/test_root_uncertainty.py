@@ -311,6 +311,7 @@ def done(folder, tmp_path_factory):
     return out, root_uncertainty.run(folder, out, **SMALL)
 
 
+@pytest.mark.slow
 def test_a_run_writes_tables_pictures_and_lines(done):
     out, report = done
     tables = {"3 cameras", "2 cameras", "differences", "rates", "recovery", "speed", "tuning"}
@@ -340,6 +341,7 @@ def test_a_run_writes_tables_pictures_and_lines(done):
     assert any("better than SIR" in line for line in report.findings)
 
 
+@pytest.mark.slow
 def test_parts_go_on_from_what_is_kept(done, folder, tmp_path, monkeypatch):
     out, report = done
     settings = {"settings": str(shutil.copytree(out, tmp_path / "earlier"))}  # what it chose

@@ -23,6 +23,7 @@ SCRIPTS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_quick_run_agrees_and_is_written(script, run_here, tmp_path):
     written = tmp_path / "table.md"
@@ -70,6 +71,7 @@ def test_a_peer_that_is_missing_is_named_with_how_to_install_it(capsys):
     assert "benchmarks/README.md" in printed
 
 
+@pytest.mark.slow
 def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(run_here, tmp_path):
     persons = tuple(f"s0{i}" for i in range(1, 7))
     recordings = few_recordings("kinect_utd_mhad", tmp_path, 6, persons)
@@ -88,6 +90,7 @@ def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(run_he
     assert (out / "levers.md").read_text() == second
 
 
+@pytest.mark.slow
 def test_every_training_person_is_held_out_once(run_here, few_people, tmp_path):
     options = ("--quick", "--every", "3", "--data", str(few_people), "--out", str(tmp_path))
     printed = run_here("ub_people_by_person", *options)
@@ -97,6 +100,7 @@ def test_every_training_person_is_held_out_once(run_here, few_people, tmp_path):
     assert len(list(tmp_path.glob("*.safetensors"))) == 6
 
 
+@pytest.mark.slow
 def test_every_place_is_tracked_by_all_three(run_here, few_people, tmp_path):
     options = ("--quick", "--data", str(few_people), "--out", str(tmp_path))
     printed = run_here("ub_people_places", *options)

@@ -89,6 +89,7 @@ def test_hand_density_against_a_plain_kalman_filter():
         m, p = m + gain @ (z[t, rows] - h @ m), p - gain @ h @ p
 
 
+@pytest.mark.slow
 def test_protocol_on_tiny_videos(tmp_path, monkeypatch):
     monkeypatch.setattr(signer, "GAPS", (0.0, 1.0))
     folder = write_videos(tmp_path / "signer")

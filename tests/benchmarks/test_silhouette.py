@@ -157,6 +157,7 @@ def done(folder, tmp_path_factory):
     return out, options, silhouette.run(folder, out, **options)
 
 
+@pytest.mark.slow
 def test_a_run_writes_tables_pictures_and_lines(done):
     out, _, report = done
     assert list(report["errors"].rows) == ["p1 p1_0", "all"]
@@ -175,6 +176,7 @@ def test_a_run_writes_tables_pictures_and_lines(done):
     assert any("paper's order" in line for line in report.findings)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     out, options, report = done
     for path in sorted(out.glob("run-*.npz"))[:2]:
@@ -194,6 +196,7 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
 
 
+@pytest.mark.slow
 def test_other_conditions(folder, tmp_path, clips, monkeypatch):
     """Cameras of a file, one camera, a published exponent, a looped walk, a found first pose."""
     search = partial(filters.find_first_pose, n_particles=200, n_tracking=50)
@@ -226,6 +229,7 @@ def test_other_conditions(folder, tmp_path, clips, monkeypatch):
     assert report["sequences"].rows["p1 p1_0 looped 1 times"][0] > 50
 
 
+@pytest.mark.slow
 def test_several_conditions_with_the_settings_of_an_earlier_run(done, folder, tmp_path):
     """One table over particles and sizes; a row of it is the run of that condition alone."""
     earlier, _, _ = done
@@ -250,6 +254,7 @@ def test_several_conditions_with_the_settings_of_an_earlier_run(done, folder, tm
         read_settings(tmp_path / "out", ["sir", "apf"])
 
 
+@pytest.mark.slow
 def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_path, monkeypatch):
     """Sharpness 30 is put in place of what validation chooses with 20 particles, else 300."""
 
@@ -268,6 +273,7 @@ def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_
     assert "differences" not in report  # nothing to compare with
 
 
+@pytest.mark.slow
 def test_an_unseen_action_by_name(tmp_path):
     folder = write_walkers(tmp_path / "mocap", ("p1",), 4, 30)
     path = folder / "p1_3.npz"

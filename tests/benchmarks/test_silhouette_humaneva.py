@@ -74,6 +74,7 @@ def test_partitions(made, tmp_path):
     torch.testing.assert_close(split.validation[0].recorded, everything[24:])
 
 
+@pytest.mark.slow
 def test_silhouettes_of_the_videos_are_in_step_with_the_motion(made, out):
     root, rig = made
     footage, (split,) = splits_of(root, out)
@@ -123,6 +124,7 @@ def test_gaps_are_left_out(made, tmp_path, monkeypatch):
     assert all(bool(c.joints.isfinite().all()) for c in (*split.manifold, *split.validation))
 
 
+@pytest.mark.slow
 def test_a_whole_run(made, out):
     options = {
         "progress": False, "actions": ("Walking",), "method": ("sir", "mrpf"), "seeds": 2,

@@ -18,6 +18,7 @@ def data(tmp_path_factory):
     return write_one(tmp_path_factory.mktemp("data") / "burke_kinect")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchpose.errors.DegenerateFilterWarning")
 def test_all_trackers(data, tmp_path):
     report = ub_one.run(

@@ -30,6 +30,7 @@ def result(data, tmp_path_factory):
     return report, out
 
 
+@pytest.mark.slow
 def test_tables_and_files(result):
     report, out = result
     errors = report["errors_3d"]

@@ -1,5 +1,6 @@
 """Persons whom no prior saw, by measured joints: geometry that is told the truth, and a quick run."""
 
+import pytest
 import torch
 
 from benchmarks.ub_people_joints import lifted
@@ -24,6 +25,7 @@ def test_geometry_that_is_told_everything_finds_the_truth_where_pixels_are_exact
     assert 0 < means[0] < means[1] < means[2]
 
 
+@pytest.mark.slow
 def test_a_quick_run_has_trackers_learned_lifters_and_geometry(run_here, few_people, tmp_path):
     printed = run_here(
         "ub_people_joints", "--quick", "--data", str(few_people), "--out", str(tmp_path)

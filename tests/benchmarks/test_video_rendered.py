@@ -1,6 +1,9 @@
 """The table of rendered performers, on a second of one of them."""
 
+import pytest
 
+
+@pytest.mark.slow
 def test_true_pixels_beat_the_mean_pose_and_all_is_kept(run_here, tmp_path):
     options = ("--quick", "--out", str(tmp_path), "--only", "mean shift")
     printed = run_here("video_rendered", *options)

@@ -92,6 +92,7 @@ def tensors_and_facts(kind, path):
     return found.state_dict(), facts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_the_file_of_the_training_loop(kind, torchpose, walks, exercises, tmp_path):
     pytest.importorskip("lightning", reason="training needs the extra `train`")

@@ -505,6 +505,7 @@ def test_inputs_in_the_order_of_a_shell_are_refused(inputs, cameras, camera):
         check_numbers(inputs, cameras)
 
 
+@pytest.mark.slow
 def test_cameras_that_do_not_agree_end_with_one(track, scene, tmp_path):
     """Keypoints of another room, in two cameras: the poses are those of one camera alone."""
     other = scene[2][:, 1].flip(0) * torch.tensor([0.3, 1.0]) + torch.tensor([40.0, 90.0])

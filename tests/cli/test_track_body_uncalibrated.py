@@ -76,6 +76,7 @@ def test_the_world_of_a_guessed_camera_is_upright(track, scene, tmp_path):
     assert bool((poses[..., 2] < -2.0).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cameras", "words"),
     [

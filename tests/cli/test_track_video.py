@@ -118,6 +118,7 @@ def test_a_video_that_is_too_short_is_said_to_be(track, tmp_path):
     assert "short.mp4 has 5 frames (0.17 s), too few for poses" in done.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [1, 2])
 def test_a_video_on_its_side_is_said_to_be(clip, track, tmp_path, turns):
     side = tmp_path / "side.mp4"
@@ -173,6 +174,7 @@ def test_notes_of_all_persons_are_said_once_and_by_name_where_they_differ():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_report_has_the_notes_of_the_track(tmp_path, clip, track):
     path, _ = clip
     twice = tmp_path / "twice.mp4"
@@ -187,6 +189,7 @@ def test_the_report_has_the_notes_of_the_track(tmp_path, clip, track):
     assert note in done.out and note in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full_disk", [False, True])
 def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch, full_disk):
     if full_disk:
@@ -310,6 +313,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(clip, track, monkey
     assert list(out.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_poses_and_pictures_are_kept_when_the_overlay_does_not_fit(clip, track, monkeypatch):
     """Another process draws the pictures."""
     monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
@@ -323,6 +327,7 @@ def test_poses_and_pictures_are_kept_when_the_overlay_does_not_fit(clip, track, 
     assert kept == {p.name for p in out.iterdir()}
 
 
+@pytest.mark.slow
 def test_torch_frames_are_frames(clip, files):
     from torchpose import VideoTracker
     from torchpose.priors import load_prior

@@ -99,6 +99,7 @@ def left_out(data, tmp_path_factory):
     return report, out
 
 
+@pytest.mark.slow
 def test_one_line_for_each_person(left_out):
     report, out = left_out
     table = report["persons"]
@@ -220,6 +221,7 @@ def second_recipe(recordings, **options):
     return recipe(recordings, **(options | {"n_components": 3}))
 
 
+@pytest.mark.slow
 def test_learning_curve(data, tmp_path):
     report = learning_curve.run(
         data, tmp_path, progress=False, counts=(1, 3, 4), n_own=1, n_subsets=2, every=2,
@@ -305,6 +307,7 @@ def test_recipes_by_name(data, tmp_path):
         learning_curve.run(data, tmp_path, progress=False, counts=(1, 9))
 
 
+@pytest.mark.slow
 def test_across_data_sets(data, tmp_path):
     report = cross_dataset.run(data, tmp_path, progress=False, part="cross", recipe=recipe)
     cross = report["cross"]
@@ -321,6 +324,7 @@ def test_across_data_sets(data, tmp_path):
         cross_dataset.run(data / "burke_kinect", tmp_path, part="cross")
 
 
+@pytest.mark.slow
 def test_across_any_data_sets(data, tmp_path):
     """Three folders of other names: nothing has to be made up where all have the same joints."""
     folders = [
@@ -349,6 +353,7 @@ def test_across_any_data_sets(data, tmp_path):
     assert list(report["completion"].rows) == ["heads of mocap_berkeley_mhad"]
 
 
+@pytest.mark.slow
 def test_motion_capture_added_to_any_data_sets(data, tmp_path):
     folders = [
         write_people(tmp_path / name, persons, n_frames=60, first=first)
@@ -389,6 +394,7 @@ def test_motion_capture_is_thinned_to_a_share(data):
     assert cross_dataset._at_most([recording] * 3, 10_000) == [recording] * 3
 
 
+@pytest.mark.slow
 def test_uncommon_poses(data, tmp_path, monkeypatch):
     monkeypatch.setattr("benchmarks.ub_people.TRAIN_PERSONS", ("s1", "s2"))
     shares = [

@@ -56,6 +56,7 @@ def test_errors_are_those_of_the_tracker_and_of_the_mean_pose(folder, prior, sco
         assert found == pytest.approx(float(wanted[j]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_recordings_are_tracked_at_their_own_rates(folder, tmp_path) -> None:
     """Of one person at two rates, all frames have the errors of both recordings by themselves."""
     prior = load_prior("kinect-upper-body-small")

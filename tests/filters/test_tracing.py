@@ -45,6 +45,7 @@ def differences():
     return differences_of("tests.filters.traced_steps", *TRACED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", TRACED)
 def test_what_is_traced_has_no_break_and_gives_the_numbers_of_the_plain_one(differences, case):
     assert differences[case] <= 1e-12

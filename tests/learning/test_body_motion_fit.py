@@ -170,6 +170,7 @@ def test_hips_that_stay_where_a_person_has_them_hardly_shift(articulation):
     assert found.shift_time[others].tolist() == pytest.approx([SHIFT_TIME] * 3, rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [FPS, 60.0])
 def test_limbs_that_swing_have_mean_accelerations(articulation, fps):
     """A thigh is a driven pendulum; a shank is pushed by how its thigh turns. Both sides are alike."""

@@ -272,6 +272,7 @@ def _process(rank, size, folder, n):
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_two_processes_fit_the_mixture_of_one(tmp_path):
     mp.spawn(_process, (2, str(tmp_path), N), nprocs=2)
     found = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2)]

@@ -99,6 +99,7 @@ def test_rates_of_jittering_time_stamps_count_as_one():
     assert facts["fps"] == pytest.approx(30.0, abs=0.06)
 
 
+@pytest.mark.slow
 def test_held_out_persons_are_tracked_at_the_rates_of_their_recordings(monkeypatch):
     """A person who is recorded at both rates has the errors of both recordings by themselves."""
     people = [recording(film(40, seed), f"p{seed}") for seed in range(3)]

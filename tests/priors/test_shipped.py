@@ -72,6 +72,7 @@ def test_its_configuration_makes_it_and_holds_persons_out(kind, name):
     assert settings["held_out"] and not fitted & set(settings["held_out"])
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_manifold_is_made_again_by_its_configuration(tmp_path, torchpose_command, monkeypatch):
     data = data_dir_or_skip("mocap_cmu_walk")

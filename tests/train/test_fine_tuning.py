@@ -96,6 +96,7 @@ def whole(scene) -> UpperBodyPrior:
     return tuned(scene, "whole")
 
 
+@pytest.mark.slow
 def test_noise_is_tuned_and_the_file_says_so(scene, whole) -> None:
     base = tuned(scene, "base")
     assert whole.info.name == "whole" and "fine-tune.yaml" in whole.info.command
@@ -117,6 +118,7 @@ def test_noise_is_tuned_and_the_file_says_so(scene, whole) -> None:
     assert "held_out" in log.splitlines()[0] and len(log.splitlines()) == 1 + 6 + 4
 
 
+@pytest.mark.slow
 def test_a_fit_that_died_goes_on_to_the_same_result(scene, whole, monkeypatch) -> None:
     loss, calls = SequenceBatches.loss, []
 
@@ -144,6 +146,7 @@ def test_a_checkpoint_of_other_settings_is_refused(scene, whole, capsys) -> None
     assert "learning_rate was 0.05, is 0.1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_same_prior(scene, whole) -> None:
     out = scene.home / "shared.safetensors"
     command = [sys.executable, "-m", "train", *scene.arguments, "--prior.out", str(out)]
@@ -158,6 +161,7 @@ def test_two_processes_make_the_same_prior(scene, whole) -> None:
     assert tuned(scene, "shared").info.extra["fine_tuned"] == whole.info.extra["fine_tuned"]
 
 
+@pytest.mark.slow
 def test_it_ends_when_held_out_persons_are_tracked_no_better(scene, monkeypatch) -> None:
     worse = iter([0.05, 0.04, 0.06, 0.07, 0.08, 0.09])
     monkeypatch.setattr(SequenceBatches, "error", lambda *_: next(worse))
@@ -238,6 +242,7 @@ def test_a_prior_is_not_tuned_into_its_own_place(scene, capsys) -> None:
     assert base.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_steps_without_a_finite_gradient_are_left_out(scene, monkeypatch, capsys) -> None:
     loss = SequenceBatches.loss
 

@@ -51,6 +51,7 @@ def assert_same(prior, wanted, tolerance):
         torch.testing.assert_close(ours[name], value, rtol=tolerance, atol=tolerance, msg=name)
 
 
+@pytest.mark.slow
 def test_prior_is_that_of_torchpose_fit(fitted, recordings):
     prior, wanted = load_prior(fitted / "p.safetensors"), reference(recordings)
     assert_same(prior, wanted, 1e-8)
@@ -62,6 +63,7 @@ def test_prior_is_that_of_torchpose_fit(fitted, recordings):
     assert ours["log_likelihood"] == pytest.approx(fit["log_likelihood"], abs=1e-8)
 
 
+@pytest.mark.slow
 def test_windows_and_a_first_pass(recordings, tmp_path):
     values = settings(recordings, tmp_path, **WINDOWS)
     assert main(["fit", "--config", str(write_settings(tmp_path, values))]) == 0

@@ -399,6 +399,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_killed_workers_lose_nothing_and_nothing_is_made_twice(data, prior_file, tmp_path) -> None:
     """A live process takes over from a killed one; after all are killed, torchrun does the rest."""
     out, flags = tmp_path / "out", [tmp_path / "stuck0", tmp_path / "stuck1"]
@@ -443,6 +444,7 @@ def test_killed_workers_lose_nothing_and_nothing_is_made_twice(data, prior_file,
     assert all(int(table[name]["frames"]) == n for name, n in LENGTHS.items())
 
 
+@pytest.mark.slow
 def test_a_live_process_takes_over_from_a_killed_one(data, prior_file, tmp_path) -> None:
     out, flag = tmp_path / "out", tmp_path / "stuck"
     arguments = [str(data), "--out", str(out), "--track.prior", prior_file]

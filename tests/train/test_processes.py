@@ -56,6 +56,7 @@ def test_a_signal_has_its_exit_code(recordings, tmp_path, signum, code, what):
     assert [p.name for p in last.parent.iterdir()] == ["last.ckpt"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize(("signum", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("when", ["reading", "first step", "calibration"])

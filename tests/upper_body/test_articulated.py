@@ -608,6 +608,7 @@ def test_limbs_that_nobody_sees_are_expected_nearer_than_their_lengths():
     assert bool((lengths[1][20:] < track.bone_lengths[0, 20:, 0] - 1e-4).all())
 
 
+@pytest.mark.slow
 def test_more_frames_a_second_are_no_worse():
     """The walk of the hypotheses is not narrower than they are apart: they stuck at 120 frames a second."""
     clip = data_dir_or_skip("kinect_laban") / "Ges02_balancinghands.csv"

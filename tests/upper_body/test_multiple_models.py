@@ -146,6 +146,7 @@ def test_smoothed_odds_rest_on_what_was_predicted_before_and_after(smoothed_shar
     torch.testing.assert_close(smoothed, expected, atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_lag_that_reaches_the_end_is_full_smoothing(prior, of_performer):
     few = of_performer[:, :26]
     full, longer, short = (

@@ -180,6 +180,7 @@ def test_after_a_gap_any_place_is_plausible(tracker, keypoints):
     assert bool(track.observed[:, 45:, ROWS].all())
 
 
+@pytest.mark.slow
 def test_frames_one_by_one_and_streams_alone_are_the_same(usual_tracker, keypoints):
     tracker = usual_tracker
     generator = torch.Generator().manual_seed(1)

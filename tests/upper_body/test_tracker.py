@@ -558,6 +558,7 @@ def test_what_the_recipe_made_is_saved(prior, tmp_path):
     torch.testing.assert_close(back.windows["full"].left.means, prior.windows["full"].left.means)
 
 
+@pytest.mark.slow
 def test_the_recipe_is_repeatable(tmp_path):
     recordings = [recording(performer(12, seed=s).body, person=f"p{s}") for s in (1, 2)]
     for name in ("once", "again"):

@@ -54,6 +54,7 @@ def same(one, other):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", [None, "full"])
 def test_poses_are_those_of_the_keypoint_tracker(prior, smoothing):
     detector = Performers(0.0)
@@ -66,6 +67,7 @@ def test_poses_are_those_of_the_keypoint_tracker(prior, smoothing):
     same(person.track, whole(UpperBodyTracker(prior, CAMERA, **options), detector))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", [None, "full"])
 def test_keypoints_are_tracked_anew_in_another_scene(prior, smoothing):
     frames, second = FRAMES.copy(), N // 2
@@ -154,6 +156,7 @@ def test_several_persons_have_poses_of_their_own(prior):
         assert torch.equal(again.track.joints3d, person.track.joints3d)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", [None, "full"])
 def test_a_hand_outside_of_the_image_is_expected_there(prior, smoothing):
     """Poses are those of the keypoint tracker that is told so; a camera without a size is not told."""

@@ -81,6 +81,7 @@ def parts(value):
     return [value] if not isinstance(value, tuple) else [p for v in value for p in parts(v)]
 
 
+@pytest.mark.slow
 def test_it_shows_the_same_and_tells_what_fails(tracker, images):
     """All of a view to the last bit, with the order of its elements; then an image of another kind."""
     measurer, state = tracker._measurer, tracker.init().measurer
@@ -105,6 +106,7 @@ def test_it_shows_the_same_and_tells_what_fails(tracker, images):
             next(found)
 
 
+@pytest.mark.slow
 def test_poses_are_the_same(tracker, images, started):
     alone = tracker(images)
     (person,) = tracker(Waiting(images), n_frames=N_FRAMES, workers=1)

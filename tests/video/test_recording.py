@@ -98,6 +98,7 @@ def record(tracker, found, size, smoother=None):
     return kept.finish(smoother)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 7, 32, 64])
 def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, tracked_alone, size):
     found = frames(keypoints, [[0]] * 40)
@@ -144,6 +145,7 @@ def one_by_one(tracker, two_persons):
     return record(tracker, two_persons, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [9, 32, 64])
 def test_blocks_give_what_single_frames_give(tracker, two_persons, one_by_one, size):
     blocks = record(tracker, two_persons, size)

@@ -88,6 +88,7 @@ def with_gaps(one_person):
     return frames
 
 
+@pytest.mark.slow
 def test_missed_frames_take_their_time(prior, one_person, with_gaps):
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
     shown = []
@@ -106,6 +107,7 @@ def test_missed_frames_take_their_time(prior, one_person, with_gaps):
     torch.testing.assert_close(track.joints3d, own.joints3d, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_step_of_a_frame_before_which_some_were_missed(prior, with_gaps):
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
     state = tracker.init()
@@ -119,6 +121,7 @@ def test_a_step_of_a_frame_before_which_some_were_missed(prior, with_gaps):
     torch.testing.assert_close(pose.joints3d, whole.joints3d[:, -1:], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person):
     """Behind a curtain that is drawn, and opened at once."""
     shown = one_person
@@ -138,6 +141,7 @@ def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person
     assert person.track.failed_at.tolist() == [-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"smoothing": "full"}, {"candidates": True}])
 def test_all_begins_anew_where_the_video_cuts_to_another_scene(prior, one_person, options):
     """From there on the poses are those of the second scene alone."""
@@ -236,6 +240,7 @@ def test_images_are_held_for_edges_alone(prior, edges):
     assert max(held) >= 32 if edges else max(held) <= 8
 
 
+@pytest.mark.slow
 def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one_person):
     shown = one_person[:30]
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", candidates=True)

@@ -34,6 +34,7 @@ def pixel(point: torch.Tensor) -> np.ndarray:
     return np.array([u / w, v / w])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [1.3, 1.6, 2.0])
 def test_the_face_is_found_where_it_is(distance):
     detector = HaarFaceDetector()

@@ -299,6 +299,7 @@ def follow(action, states, n_particles, n_seeds):
     return {name: torch.stack([d[name] for d in details], 1) for name in details[0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("action", ["bend", "wave"])
 def test_a_bank_tells_the_action(action):
     bank = ActionBank([BEND, WAVE])

@@ -146,6 +146,7 @@ def test_errors_are_those_that_were_made(three):
     assert float(found.promise[2]) < float(found.promise[:2].max()) + float(found.cost[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "change"),
     [
@@ -174,6 +175,7 @@ FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 FLIP_UP = torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
 
 
+@pytest.mark.slow
 def test_two_cameras_that_agree_poorly_are_said():
     two = scene(2, n_frames=20)
     for rig in (with_focal(two.rig, 0.85), turned(two.rig, 1.5)):

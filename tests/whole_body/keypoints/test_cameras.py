@@ -82,6 +82,7 @@ def in_step(late):
 # --- delays -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_delays_are_found(late, in_step):
     found = in_step
     delays, std = found.details["camera_delays"], found.details["camera_errors_std"][..., DELAY]
@@ -152,6 +153,7 @@ def test_a_rotation_leaves_a_camera_in_its_place(right):
     torch.testing.assert_close(rotvec_to_matrix(1e-6 * values[0, :3]), small)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undoubted_here")
 def test_poses_stay_as_given_where_delays_explain_all(late, in_step):
     found = track(late, refine="both")
@@ -163,6 +165,7 @@ def test_poses_stay_as_given_where_delays_explain_all(late, in_step):
     assert not any("was turned by" in note for note in found.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undoubted_here")
 def test_a_camera_that_is_left_out_since_it_is_late_is_used_again():
     rig, seen = ring(3), [jumping(-delay / FPS) for delay in (0, 8, 0)]

@@ -246,6 +246,7 @@ def test_a_camera_that_stands_still_is_not_used(three):
     torch.testing.assert_close(live.joints3d[0], found.joints3d[11])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undoubted_here")
 def test_what_is_refined_leaves_wrong_cameras_out():
     seen = scene(4, n_frames=14)

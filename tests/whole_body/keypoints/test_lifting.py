@@ -310,6 +310,7 @@ def test_a_height_that_is_told_stays():
     assert track.body.height == pytest.approx(1.7, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [2, 4])
 def test_strangers_who_walk_may_be_filmed_at_half_and_a_quarter_of_the_rate(every):
     data = data_dir_or_skip(WALKS).parent

@@ -35,6 +35,7 @@ def tracked(n_cameras, smoothing, feet=False, n_frames=_FEW_FRAMES):
     return tracker(keypoints=keypoints, names=names, smoothing=smoothing)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", ["none", "full"])
 @pytest.mark.parametrize(("n_cameras", "feet"), [(3, True), (1, False)])
 def test_parts_give_the_numbers_of_all_frames(monkeypatch, n_cameras, feet, smoothing):
@@ -66,6 +67,7 @@ class Largest(TorchDispatchMode):
         return made
 
 
+@pytest.mark.slow
 def test_no_tensor_is_larger_than_the_states(monkeypatch):
     """Products of Jacobians and states were fifteen times as large, 0.7 MB a frame."""
     in_parts_of(1, monkeypatch)

@@ -114,6 +114,7 @@ def ray_of(given, track):
     return track.joints3d[-1, PELVIS] - centre
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smoothing", ["none", "full"])
 def test_covariances_of_one_camera_do_not_know_the_distance(smoothing):
     given = scene(1, 25)

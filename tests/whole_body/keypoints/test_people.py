@@ -137,6 +137,7 @@ def test_two_detections_of_two_cameras_tell_no_turn():
     assert told(apart) is None
 
 
+@pytest.mark.slow
 def test_a_note_names_the_camera_whose_detections_are_nobodys():
     rig, _, pixels = passing(3)
     notes = [
@@ -210,6 +211,7 @@ def followed(rig, pixels):
     return sorted((one.first_frame, len(one)) for one in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cameras", "seconds"), [(2, 0.5), (2, 0.9), (1, 0.5)])
 def test_who_walks_on_unseen_is_the_same_person(cameras, seconds):
     rig, pixels = walkers([(-1.0, 0.0), (-1.0, 1.0)], cameras)
@@ -263,6 +265,7 @@ def test_two_persons_whom_one_camera_each_sees_stay_two(turn):
     assert max(float(each.min()) for each in off) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 4.0])
 def test_somebody_whom_another_camera_sees_does_not_move_a_person(turn):
     rig, joints, pixels = back_to_back(turn)
