@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose._core.module_state import outside_inference
 from torchpose.upper_body._absence import log_beyond
+from torchpose.upper_body._arm_reach import loss_beyond_reach
 from torchpose.upper_body._direction_density import DirectionDensity
 from torchpose.upper_body._lifted_arms import LiftedBones
 from torchpose.upper_body._limb_nodes import (
@@ -186,7 +187,7 @@ class ArmChain:
         """
         upper, variance = _upper_nodes(arm, ends[0], sizes[0], rows)
         lower = _lower_nodes(arm, ends[1], sizes[1], (upper, variance), rows)
-        weight = upper.log_weight[..., None] + lower.log_weight
+        weight = upper.log_weight[..., None] + lower.log_weight - loss_beyond_reach(upper, lower)
         if not ends[1] and arm.borders is not None and arm.log_inside is not None:
             borders = _taken(arm.borders, rows)[..., None, :, :]
             log_inside = _taken(arm.log_inside, rows)[..., None, None]
