@@ -14,16 +14,12 @@ import pytest
 from tests.fuzz import engine, mutate, readers, samples, worker
 from torchpose.errors import FileFormatError
 
-_ENOUGH = 50  # cases of a kind, of which some are read and some refused; a busy machine tries fewer
-
 
 def test_damaged_files_and_odd_calls(request):
     result = engine.fuzz(request.config.getoption("--fuzz-seconds"))
     shown = "\n".join(json.dumps(case) for case in result.bad[:20])
     assert not result.bad, f"{result.table()}\n{shown}"
     for kind, outcomes in result.outcomes.items():
-        if outcomes.total() < _ENOUGH:
-            continue
         assert outcomes["refused"] > 0, kind
         assert outcomes["read"] > 0 or kind == "video", kind
 

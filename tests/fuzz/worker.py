@@ -24,6 +24,7 @@ __all__ = ["KINDS", "main"]
 KINDS = (*SAMPLES, "info", "calls")  # as in `tests.fuzz.engine`, which starts without the library
 _MEMORY = 512 << 20  # bytes that a case may take beyond those of the start
 _SECONDS, _WAITING = 10, 60  # of processor time, and by the clock for what waits for something
+_LEAST_CASES = 50  # of each kind, of which some are read and some refused
 
 
 class _Slow(BaseException):
@@ -31,7 +32,10 @@ class _Slow(BaseException):
 
 
 def main(seed: int, kinds: list[str], seconds: float, start: int) -> None:
-    """Cases of each kind in turn, until so many seconds of processor time are used."""
+    """Cases of each kind in turn, until so many seconds of processor time are used.
+
+    There are `_LEAST_CASES` of each at least: on a busy machine cases take more processor time.
+    """
     torch.set_num_threads(1)
     torch.set_warn_always(True)  # else only the first of all cases would be seen to lose values
     with tempfile.TemporaryDirectory() as folder:
@@ -39,7 +43,7 @@ def main(seed: int, kinds: list[str], seconds: float, start: int) -> None:
         _check_whole(Path(folder), whole)
         _limit()
         begin, index = time.process_time(), start
-        while time.process_time() < begin + seconds:
+        while index < start + _LEAST_CASES or time.process_time() < begin + seconds:
             for kind in kinds:
                 _say(case=[kind, index])
                 _say(**run_case(seed, kind, index, Path(folder), whole))
