@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import math
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchpose.upper_body._limb_nodes import LimbNodes
 
@@ -39,11 +37,8 @@ def loss_beyond_reach(upper: LimbNodes, lower: LimbNodes) -> Float[Tensor, "*bat
     down, back = upper.directions[..., 1:].unbind(-1)
     down, behind = down.clamp_min(0.0), back.clamp_min(0.0)
     of_upper = _SHARPNESS * (back - _RAISED - _LOWERED * down)
-    limit = behind + _STRAIGHT + _TURNED * (1.0 - down)
-    # one product gives f_z - limit; in place, since memory for as many numbers again takes longer
-    axes = lower.axes[..., 2]
-    shape = torch.broadcast_shapes(axes.shape[:-1], limit.shape)
-    told = torch.cat([axes.expand(*shape, -1), limit.expand(shape)[..., None]], -1)
-    loss = (_SHARPNESS * told) @ pad(lower.turns, (0, 1), value=-1.0).mT
-    loss = loss.clamp_(0.0, _MOST).square_()
+    limit = _SHARPNESS * (behind + _STRAIGHT + _TURNED * (1.0 - down))
+    forearm = (_SHARPNESS * lower.axes[..., 2]) @ lower.turns.mT
+    # in place: memory for as many numbers again takes longer than the arithmetic
+    loss = (forearm - limit[..., None]).clamp_(0.0, _MOST).square_()
     return loss.add_(of_upper.clamp(0.0, _MOST).square()[..., None])
