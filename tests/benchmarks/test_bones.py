@@ -29,6 +29,7 @@ def test_errors_of_the_truth_are_none(data):
     assert 2 < errors(chain, view.truth)[0] < 30
 
 
+@pytest.mark.slow
 def test_quick_run_prints_every_method(run_here, data, tmp_path):
     few, pictures = tmp_path / "data", tmp_path / "pictures"
     few_recordings("kinect_utd_mhad", few, 2, ("s07", "s08"))

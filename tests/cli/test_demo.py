@@ -130,6 +130,7 @@ def walked(tmp_path_factory):
     return out, printed.getvalue()
 
 
+@pytest.mark.slow
 def test_a_walk_in_three_cameras_needs_no_data(walked):
     out, printed = walked
     assert "neither recorded nor drawn from the manifold" in " ".join(printed.split())

@@ -244,6 +244,7 @@ def test_a_configuration_names_the_command(torchpose, walks, tmp_path):
     assert recorded_command(given) == "torchpose fit limbs r0 '...19 more' --out x.safetensors"
 
 
+@pytest.mark.slow
 def test_lightning_is_not_imported(walks, tmp_path):
     code = (
         "import sys; from torchpose.cli import main; "

@@ -118,6 +118,7 @@ def test_a_folder_with_other_files_of_these_names(track, tmp_path):
     assert content(out) == {"poses.csv": b"mine"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_run_leaves_the_results_of_the_one_before(track, files, tmp_path):
     out = tmp_path / "out"

@@ -532,6 +532,7 @@ def test_delays_bring_cameras_in_step(track, scene, tmp_path):
         assert (done.code, "from 0 to below the number of frames" in done.err) == (2, True)
 
 
+@pytest.mark.slow
 def test_cameras_are_refined_and_written(track, torchpose, scene, tmp_path):
     folder = scene[0]
     given = ("front_json", "left.csv", "behind.npz")

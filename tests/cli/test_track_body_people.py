@@ -53,6 +53,7 @@ def track(torchpose, scene):
     return on_files(torchpose, scene[0], "--fps", FPS, "--height", 1.75)
 
 
+@pytest.mark.slow
 def test_all_persons_are_tracked_written_and_drawn(track, scene, tmp_path):
     joints = scene[1]
     videos = ("--videos", *(f"{name}.mp4" for name in PLACES))

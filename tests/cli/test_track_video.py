@@ -131,6 +131,7 @@ def test_a_video_on_its_side_is_said_to_be(clip, track, tmp_path, turns):
     assert f"turned by {90 * turns} degrees clockwise: turn it" in done.out
 
 
+@pytest.mark.slow
 def test_several_persons_and_then_one(clip, track, tmp_path):
     path, _ = clip
     wide = tmp_path / "wide.mp4"

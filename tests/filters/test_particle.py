@@ -260,6 +260,7 @@ def grid_problem(dim):
     return prior, process, noise, list(range(dim)), z, mask, points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("dim", [1, 2])
 def test_mixture_and_scaled_walk_share_the_exact_posterior(dim, dtype):

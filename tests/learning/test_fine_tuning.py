@@ -146,6 +146,7 @@ def test_the_gradient_through_the_filter_is_that_of_finite_differences(
     assert (model.gamma is not None) == (transition == "ou")
 
 
+@pytest.mark.slow
 def test_the_loss_of_noise_falls_and_the_tuned_prior_tracks_better(prior, sequences, tmp_path):
     poor = dict(prior.noise) | {"process_cov": released_process_cov() * 1e-3}
     start = UpperBodyPrior(prior.left, prior.right, prior.info, poor)

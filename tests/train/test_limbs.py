@@ -104,6 +104,7 @@ def test_it_is_the_fit_of_the_library_on_one_body(scene) -> None:
         assert torch.equal(found.state_dict()[name], value), name
 
 
+@pytest.mark.slow
 def test_it_is_resumed_only_with_its_own_settings(scene, capsys) -> None:
     assert run(scene, "again", "--data.init_args.held_out", "null") == 0
     assert "persons held out" not in capsys.readouterr().out

@@ -155,6 +155,7 @@ def test_several_persons_are_pooled(scene) -> None:
     assert info.sequences == ("set#p0",) * 2 + ("set#p1",) * 3
 
 
+@pytest.mark.slow
 def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     holes = scene.home / "holes"
     holes.mkdir(exist_ok=True)

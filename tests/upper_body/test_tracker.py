@@ -64,7 +64,10 @@ def mean_error(track, truth):
     return float(joint_errors_3d(track.joints3d[0], truth).mean())
 
 
-@pytest.mark.parametrize("smoothing", [None, "full", 3, 20])
+@pytest.mark.parametrize(
+    "smoothing",
+    [None, "full", *(pytest.param(lag, marks=pytest.mark.slow) for lag in (3, 20))],
+)
 @pytest.mark.parametrize("method", [None, "mkf-fixed"])
 def test_the_performer_is_tracked_better_than_by_the_mean_pose(
     prior, scene, plain, method, smoothing

@@ -199,6 +199,7 @@ def test_precisions_of_the_program_change_nothing(prior, one_person, hands):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_who_cross_stay_who_they_are(prior, pair, two_persons):
     tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
     people = tracker(two_persons)

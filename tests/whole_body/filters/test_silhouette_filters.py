@@ -378,6 +378,7 @@ def manifold_filter(z, manifold, weights):
     return [torch.stack(part) for part in zip(*out, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("proposal", MANIFOLD_PROPOSALS)
 @pytest.mark.parametrize("weights", MANIFOLD_WEIGHTS)
 def test_the_manifold_filter_agrees_with_the_exact_posterior(weights, proposal):

@@ -195,6 +195,7 @@ def test_flags_are_moved_as_their_frames_are():
 # --- what is right, and what nobody asked for ---------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_right_cameras_stay_and_nothing_is_said(right, tracked):
     found = track(right, refine="both")
     assert not found.details["camera_delays"].any()

@@ -207,6 +207,7 @@ def test_several_persons_have_their_feet(four, tracked):
     assert smoothed[0].feet.points3d.shape == (frames, 6, 3)
 
 
+@pytest.mark.slow
 def test_refined_cameras_give_feet(four):
     shown, feet, keypoints = four
     found = BodyTracker(shown.rig, "kalman", fps=FPS)(

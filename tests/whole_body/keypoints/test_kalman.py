@@ -458,6 +458,7 @@ def test_one_camera_hands_a_person_to_the_next():
     assert float(errors(found, given.joints[16:]).mean(-1).max()) < 0.4
 
 
+@pytest.mark.slow
 def test_another_camera_that_sees_somebody_else_goes_on_after_half_a_second():
     given = scene(2, 40, noise=2.0)
     aside = given.joints + torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64)

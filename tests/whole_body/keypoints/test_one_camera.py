@@ -194,6 +194,7 @@ def test_several_cameras_say_nothing_of_the_pelvis():
     assert "covariance_from_pelvis" not in track(scene(2, 3)).details
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [1.5, 1.9])
 def test_a_camera_of_known_height_finds_how_large_a_person_is(height):
     given = scene(1, 30, height=height)
