@@ -330,6 +330,23 @@ def returning():
     return given._replace(joints=joints, keypoints=keypoints)
 
 
+@pytest.mark.parametrize("persons", [None, "all"])
+def test_live_steps_tell_when_tracking_begins_anew(returning, persons):
+    keypoints = returning.keypoints[:48]
+    if persons is not None:  # one of several who is away for a second is another one
+        keypoints = torch.cat([keypoints[:35], returning.keypoints[46:48]])[:, :, None]
+    live = tracker(returning.rig)
+    whole = live(keypoints=keypoints, persons=persons)
+    (whole,) = whole if isinstance(whole, list) else [whole]
+    state, anew = live.init(), []
+    for frame in keypoints:
+        state, now = live.step(state, keypoints=frame, persons=persons)
+        anew.append([bool(one.respread) for one in (now if isinstance(now, list) else [now])])
+    begins = len(keypoints) - 2
+    assert whole.respread.nonzero().flatten().tolist() == [begins]
+    assert [t for t, one in enumerate(anew) if one == [True]] == [begins]
+
+
 @pytest.mark.parametrize("smoothing", ["none", "full"])
 def test_who_was_away_for_a_second_and_turned_is_right_at_once(returning, smoothing):
     found = track(returning, smoothing)

@@ -216,7 +216,8 @@ class KeypointBodyTracker(nn.Module):
         frame = frame.map(lambda value: value[None])
         before, standing = (None, None) if stream is None else stream
         body, pose, _ = self.tracker.advance(before, frame)
-        if bool(body.begun) and not (before is not None and bool(before.begun)):
+        followed = before is not None and bool(before.begun)
+        if bool(body.begun) and not followed:
             self.check_cameras(frame.map(lambda value: value[:, None]))
         found = None
         if feet is not None:
@@ -224,7 +225,9 @@ class KeypointBodyTracker(nn.Module):
             standing, found = step_feet(self.feet, standing, self.tracker.filter.maps, pose, feet)
             found = with_time(found)
         frames = frame.map(lambda value: value[:, None])
-        track = self.builder.track(with_time(pose), frames, 0, summed_up=False, feet=found)
+        track = self.builder.track(
+            with_time(pose), frames, 0, summed_up=False, feet=found, followed=followed
+        )
         faults = mapped(lambda value: value[0], body.faults)
         track.notes = notes_on_cameras_now(
             self.rig.names, faults.still, faults.off, angles_of(faults.turn)

@@ -140,11 +140,14 @@ class PeopleBodyTracker:
         if found is None:
             return LivePeople(after, None, None), []
         state, feet = self._feet_of_all(stream, found, seen)
+        former = set() if stream is None or stream.numbers is None else set(stream.numbers.tolist())
         tracks = []
         for row in (found.identity > 0).nonzero().flatten().tolist():
             own = None if feet is None else with_time(one_of(feet, row))
             who = int(found.identity[row])
-            tracks.append(self._track_of([_Row(0, row, found)], who, own, summed_up=False))
+            followed = int(found.number[row]) in former
+            one = [_Row(0, row, found)]
+            tracks.append(self._track_of(one, who, own, summed_up=False, followed=followed))
         return LivePeople(after, state, found.number), tracks
 
     def _feet_of_all(
@@ -239,13 +242,14 @@ class PeopleBodyTracker:
         feet: FootPoses | None,
         poses: KeypointPoses | None = None,
         summed_up: bool = True,
+        followed: bool = False,
     ) -> BodyTrack:
         """Return the track of one person; by default of the poses as they were filtered."""
         if poses is None:
             poses = stacked([one_of(row.frame.poses, row.row) for row in rows])
         keypoints: KeypointFrame = stacked([one_of(row.frame.keypoints, row.row) for row in rows])
         track = self.single.builder.track(
-            poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet
+            poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet, followed=followed
         )
         track.details["detection"] = torch.cat(
             [one_of(row.frame.detection, row.row) for row in rows]

@@ -68,8 +68,16 @@ class TrackBuilder:
         refined: RefinedCameras | None = None,
         first_frame: int = 0,
         feet: FootPoses | None = None,
+        followed: bool = False,
     ) -> BodyTrack:
-        """Return the track of one element of the batch, from the frame on in which it begins."""
+        """Return the track of one element of the batch, from the frame on in which it begins.
+
+        Args:
+            poses, frames: [B, T, ...], of T frames, or of one that a live stream got. b: the element.
+            summed_up: whether notes sum the recording up. cameras: whether they name cameras.
+            refined: the cameras, if they were refined. first_frame: number of the first of these frames.
+            feet: of the poses. followed: whether a live stream had found the person before this frame.
+        """
         live = poses.started.shape[1] == 1
         begun = 0 if live else int(poses.started[b].int().argmax())
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
@@ -100,7 +108,7 @@ class TrackBuilder:
             poses.log_evidence,
             torch.full_like(poses.log_evidence, torch.nan),
             poses.coasting,
-            poses.started & (poses.started.cumsum(0) > 1),
+            poses.started & (poses.started.cumsum(0) + followed > 1),
             self.fps,
             notes=notes,
             first_frame=first_frame,
