@@ -125,6 +125,17 @@ def test_a_tilt_is_stated_or_found(track, scene, tmp_path, words, said, off):
     assert float((body[:, 1] / body.norm(dim=-1)).mean()) > math.cos(math.radians(15.0))
 
 
+def test_the_camera_of_an_earlier_run_is_not_left_beside_poses_of_another_one(
+    track, scene, tmp_path
+):
+    assert track("uncalibrated", "seen.npz", "--tilt", 0).code == 0
+    own = tmp_path / "out" / "camera.toml"
+    done = track(own, "seen.npz", "--up", "y")
+    assert (done.code, own.exists()) == (0, True), done.err  # it is the camera of these poses too
+    done = track(scene[0] / "cameras.toml", "seen.npz", "--up", "y")
+    assert (done.code, own.exists()) == (0, False), done.err
+
+
 def test_where_nobody_stands_the_camera_is_taken_to_be_level(track, scene, tmp_path):
     seen = scene[1].clone()
     seen[:, [BODY_15.joint(f"{side}_knee") for side in ("left", "right")]] = torch.nan

@@ -25,6 +25,7 @@ from torchpose.cli._body_recordings import (
 )
 from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import (
+    CAMERA_FILE,
     KALMAN,
     BodyJob,
     action_text,
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_track import BodyTrack
     from torchpose.whole_body._body_tracker import BodyTracker
 
-_CAMERAS, _CAMERA = "refined_cameras.toml", "camera.toml"
+_CAMERAS = "refined_cameras.toml"
 _TILT_SECONDS = 60.0  # of the beginning, in which people tell how the camera is held
 _AGREES = 0.5  # share of the keypoints of a camera in a frame, above which it agrees with the body
 _DISAGREE = (
@@ -174,7 +175,7 @@ def _nobody(keypoints: BodyKeypoints) -> str:
 def _more(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
     """Return the names of further files: pictures, cameras."""
     pictures = [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
-    return pictures + [_CAMERAS] * (settings.refine != "none") + [_CAMERA] * settings.without_file
+    return pictures + [_CAMERAS] * (settings.refine != "none") + [CAMERA_FILE] * settings.without_file
 
 
 def _with_tilt(
@@ -202,8 +203,8 @@ def _refined(
     from torchpose.camera._pinhole import save_cameras
 
     if settings.without_file:
-        save_cameras(keypoints.cameras, stage / _CAMERA)
-        return keypoints, [stage / _CAMERA]
+        save_cameras(keypoints.cameras, stage / CAMERA_FILE)
+        return keypoints, [stage / CAMERA_FILE]
     if settings.refine == "none":
         return keypoints, []
     rotations = poses.details["camera_rotation"][0]

@@ -1,5 +1,6 @@
 """What `torchpose track-body` writes and prints: poses, the page, words."""
 
+import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,8 @@ _OWN = (
     r"|overlay(_.+\.mp4|\.png)|report\.html"
     r"|refined_cameras\.toml"
 )
+CAMERA_FILE = "camera.toml"
+"""Name of the file of a camera that was given without one."""
 _MOST_RUNS = 8  # of actions that are listed by their frames
 
 
@@ -58,10 +61,12 @@ def body_results(
     from torchpose.io._results import ResultsFolder, holds_arrays
 
     videos = [overlay_name(camera.name) for camera in cameras] if overlay else []
+    camera = (Path(job.out) / CAMERA_FILE).resolve()
+    read = any(file.resolve() == camera for file in job.files)  # an earlier run's, which stays
     return ResultsFolder(
         job.out,
         "track",
-        _OWN,
+        _OWN if read else f"{_OWN}|{re.escape(CAMERA_FILE)}",
         [*_POSES, *_exports(job), *videos, *pictures, "report.html"],
         job.files,
         lambda folder: holds_arrays(folder / _POSES[0], ("state", "joints3d", "body_skeleton")),
