@@ -175,7 +175,9 @@ def _nobody(keypoints: BodyKeypoints) -> str:
 def _more(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
     """Return the names of further files: pictures, cameras."""
     pictures = [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
-    return pictures + [_CAMERAS] * (settings.refine != "none") + [CAMERA_FILE] * settings.without_file
+    return (
+        pictures + [_CAMERAS] * (settings.refine != "none") + [CAMERA_FILE] * settings.without_file
+    )
 
 
 def _with_tilt(
