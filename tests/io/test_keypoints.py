@@ -415,6 +415,32 @@ def test_time_stamps_in_whole_milliseconds_give_the_rate_of_their_mean(tmp_path)
     assert read.fps == pytest.approx(30.0, rel=1e-3)
 
 
+def test_the_rate_by_uneven_time_stamps_is_that_of_their_mean(tmp_path):
+    steps = np.tile([28, 30, 44, 36, 42, 33, 44, 31], 20)  # milliseconds, of a busy webcam
+    times = [0, *steps.cumsum().tolist()]
+    read = read_keypoints(text(tmp_path, "timestamp,head_x,head_y", *(f"{t},10,20" for t in times)))
+    assert len(read.keypoints) == len(times)
+    assert (len(times) - 1) / read.fps == pytest.approx(times[-1] / 1000, rel=1e-6)
+    assert len(read.notes) == 1
+
+
+def test_coarse_time_stamps_of_counted_frames_give_the_rate(tmp_path):
+    rows = [f"{t // 3 / 10},{t},10,20" for t in range(90)]  # tenths of a second
+    read = read_keypoints(text(tmp_path, "time,frame,head_x,head_y", *rows))
+    assert read.fps == pytest.approx(30.0, rel=1e-6) and len(read.notes) == 1
+
+
+@pytest.mark.parametrize("header", ["time,frame,head_x,head_y", "time,head_x,head_y"])
+def test_a_rate_that_changes_is_noted(tmp_path, header):
+    times = [*(t / 30 for t in range(60)), *(2 + t / 22 for t in range(60))]
+    counted = "frame" in header
+    rows = [f"{time:.4f},{f'{t},' * counted}10,20" for t, time in enumerate(times)]
+    read = read_keypoints(text(tmp_path, header, *rows))
+    assert len(read.keypoints) == 120 and 119 / read.fps == pytest.approx(times[-1], abs=0.01)
+    assert "the rate changes" in read.notes[1] and "frame 60 comes 0.3" in read.notes[1]
+    assert "after its time stamp" in read.notes[1]
+
+
 @pytest.mark.parametrize("mark", [";", "\t"])
 def test_decimal_commas_between_semicolons_or_tabs(tmp_path, mark):
     lines = ["frame,head_x,head_y,neck_x,neck_y", "0,1.5,2.5,3.5,4.5", "1,5.5,6.5,,"]

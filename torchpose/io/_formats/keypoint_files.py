@@ -24,6 +24,7 @@ from torchpose.io._formats.raw_recording import numbers
 from torchpose.io._formats.table_rows import (
     frame_rate,
     is_time,
+    notes_on_uneven_times,
     split_row,
     split_rows,
     stamp_of,
@@ -144,9 +145,9 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
         _check_flat(path, raw.keypoints)
     raw.fps, raw.image_size = _csv_notes(path, notes)
     if raw.fps is None and times is not None:
-        raw.fps, said = _rate_by_times(rows[1:], times.stamps)
+        raw.fps, raw.notes = _rate_by_times(rows[1:], times.stamps)
         if raw.fps is not None:
-            raw.notes, left_out = (said,), [name for name in left_out if name != times.name]
+            left_out = [name for name in left_out if name != times.name]
     if left_out:
         shown = first_of(left_out, _SHOWN)
         raw.notes += (f"columns {shown} are passed over: x, y and a score of keypoints count",)
@@ -263,10 +264,16 @@ def _without_other_columns(rows: _Rows) -> tuple[_Rows, list[str]]:
     ]
 
 
-def _rate_by_times(rows: _Rows, stamps: np.ndarray) -> tuple[float | None, str]:
-    """Return the frames per second by the time stamps of rows of checked frames, and a note on them."""
+def _rate_by_times(rows: _Rows, stamps: np.ndarray) -> tuple[float | None, tuple[str, ...]]:
+    """Return the frames per second by the time stamps of rows of checked frames, and notes on them."""
     frames, first = np.unique([float(cells[0]) for _, cells in rows], return_index=True)
-    return frame_rate(np.diff(stamps[first]) / np.diff(frames))
+    told = np.isfinite(stamps[first])
+    frames, stamps = frames[told], stamps[first][told]
+    before = np.maximum.accumulate(np.concatenate([[-np.inf], stamps[:-1]]))
+    later = stamps > before  # of coarse stamps the first of those that are alike
+    frames, stamps = frames[later], stamps[later]
+    fps, note = frame_rate(np.diff(stamps), np.diff(frames))
+    return (None, ()) if fps is None else (fps, (note, *notes_on_uneven_times(fps, frames, stamps)))
 
 
 def _check_flat(path: Path, points: np.ndarray) -> None:

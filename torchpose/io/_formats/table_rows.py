@@ -16,6 +16,7 @@ _TICKS = {
     1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", KINECT_TICK: "100 ns",
     1e-9: "nanoseconds",
 }  # fmt: skip
+_UNEVEN = 0.2  # seconds from time stamps, of frames at one rate, that are worth a note
 _SLOWEST, FASTEST = 4.0, 250.0  # frames per second that a recording may have
 _TIME = re.compile(
     r"(date|frame|relative|elapsed)?_?time(_?stamp)?(_(s|sec|ms|us|usec|ns|iso|utc))?"
@@ -104,18 +105,48 @@ def usual_step(steps: np.ndarray) -> float:
     return float(steps[np.abs(steps - median) <= 0.2 * median].mean())
 
 
-def frame_rate(steps: np.ndarray) -> tuple[float | None, str]:
-    """Return the frames per second by the usual step between time stamps, and a note on their unit.
+def frame_rate(steps: np.ndarray, counts: np.ndarray | None = None) -> tuple[float | None, str]:
+    """Return the frames per second between time stamps, and a note on their unit.
 
     Of seconds, milliseconds, microseconds, 100 ns and nanoseconds, the one that comes nearest to 30
     frames per second; None for steps that are none of them, such as numbers of frames.
+
+    Args:
+        steps: between stamps. counts: by how many frames each goes on, as far as they are counted.
     """
-    steps = steps[steps > 0]
-    if not len(steps):
+    later = steps > 0
+    if not later.any():
         return None, ""
-    step = usual_step(steps)
+    step = _mean_step(steps[later], None if counts is None else counts[later])
     rates = {name: 1 / (tick * step) for tick, name in _TICKS.items()}
     name = min(rates, key=lambda name: abs(math.log(rates[name] / KINECT_FPS)))
     if not _SLOWEST <= rates[name] <= FASTEST:
         return None, ""
     return rates[name], f"time stamps taken for {name}: {rates[name]:.3g} frames per second"
+
+
+def notes_on_uneven_times(fps: float, frames: np.ndarray, stamps: np.ndarray) -> tuple[str, ...]:
+    """Return a note if frames at the rate of `frame_rate` are far from their time stamps.
+
+    Args:
+        fps: frames per second. frames: numbers that increase. stamps: of these frames, increasing too.
+    """
+    step = _mean_step(np.diff(stamps), np.diff(frames))
+    late = ((stamps - stamps[0]) / step - (frames - frames[0])) / fps
+    worst = int(np.abs(late).argmax())
+    if abs(late[worst]) <= _UNEVEN:
+        return ()
+    side = "after" if late[worst] < 0 else "before"
+    return (
+        f"the rate changes: at {fps:.3g} frames per second frame {frames[worst] - frames[0]:.0f} comes "
+        f"{abs(late[worst]):.2g} s {side} its time stamp; resample the keypoints to one rate for right "
+        "speeds and times",
+    )
+
+
+def _mean_step(steps: np.ndarray, counts: np.ndarray | None) -> float:
+    """Return the time of one frame, where some steps may be several times as long as others."""
+    counts = np.ones(len(steps)) if counts is None else counts
+    each = steps / counts
+    frames = counts * np.rint(each / usual_step(each)).clip(min=1)
+    return float(steps.sum() / frames.sum())
