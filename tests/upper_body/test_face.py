@@ -55,6 +55,37 @@ def test_a_face_that_nobody_looks_for_says_nothing():
     torch.testing.assert_close(evidence, torch.zeros_like(evidence))
 
 
+def test_a_head_of_which_nothing_is_given_may_be_outside_of_the_image():
+    lost = measured(0.0)._replace(
+        places=torch.zeros(1, 5, 2), confidence=torch.zeros(1, 5).double()
+    )
+    evidence = face_evidence(lost, STD, DEPTH, TURNS)[0, 1]
+    assert 0 < float(evidence[TURNS.cos() < -0.99] - evidence[TURNS == 0]) < 0.5
+
+
+@pytest.mark.parametrize("given", ["nothing", "hands", "all but the face"])
+def test_a_face_that_is_not_seen_does_not_turn_the_body_round(given):
+    """Nobody is seen for a second or more, or their hands alone, or their head is above the image."""
+    joints = body(60, turn=0.3)
+    face = joints[:, [ROW["head"]]] + face_of(0.3)[0]
+    names = [
+        "shoulder_left",
+        "shoulder_right",
+        "elbow_left",
+        "elbow_right",
+        "hand_left",
+        "hand_right",
+    ]
+    seen = pixels(torch.cat([joints[:, [ROW[name] for name in names]], face], 1), 2.0)
+    seen[10:, 6:] = torch.nan
+    seen[10:, : {"nothing": 6, "hands": 4}.get(given, 0)] = torch.nan
+    tracker = torchpose.UpperBodyTracker(PRIOR, CAMERA, "articulated", fps=30.0, max_gap=None)
+    found = tracker(seen[None], names=[*names, *FACE]).joints3d[0]
+    across = found[:, ROW["shoulder_left"]] - found[:, ROW["shoulder_right"]]
+    turn = torch.atan2(-across[:, 2], across[:, 0])
+    assert float((turn - 0.3).cos().min()) > math.cos(math.radians(25))
+
+
 def test_a_bad_ear_does_not_bring_a_body_near():
     face = measured(0.3)
     face.places[0, 3] += 0.3

@@ -103,7 +103,9 @@ class RootStep(NamedTuple):
             std = frame.given.std.amin(1)
             metres = self.lengths.unit * self.grid.depth  # heads of children are nearly full-grown
             of_face = face_evidence(frame.face, std, metres, self.grid.turn)
-            believed = believed * of_face[:, None].exp()
+            # where no torso is seen, a face that is not seen is not a back
+            told = frame.given.torso.any(1) | (frame.face.confidence > 0).any(1)
+            believed = believed * (told[:, None, None] * of_face)[:, None].exp()
         if frame.bones is not None:
             of_bones = power[:, None] * _turn_of_lifted(frame.bones, self.grid.turn)
             believed = believed * of_bones[:, None, None].exp()

@@ -25,6 +25,7 @@ _OUTWARD = (0.0, 20.0, -20.0, 90.0, -90.0)
 _HIDDEN = (-0.1, 0.0, 0.0, -0.3, -0.3)
 _SOFT = 0.15  # of that cosine
 _SEEN, _IMAGINED = 0.9, 0.1  # probabilities that a detector gives what is visible, what is hidden
+_LOST = 0.1  # how often nothing of a head is given wherever it looks, as outside of the image
 _SURE = 0.4  # confidence from which on a keypoint counts as given
 _NOISE = 0.02  # metres: faces and detectors differ
 _HEAD_ABOVE = 0.03  # metres from the middle of the ears to Kinect's head, 0.1 below the crown
@@ -166,4 +167,6 @@ def _visibility(face: FacePoints, turn: Tensor) -> Float[Tensor, "B P"]:
     given = _IMAGINED + (_SEEN - _IMAGINED) * visible
     sure = (face.confidence / _SURE).clamp(0.0, 1.0)[:, None]
     logs = sure * given.log() + (1 - sure) * torch.log1p(-given)
-    return (logs * face.expected.to(logs)).sum(-1)
+    logs = (logs * face.expected.to(logs)).sum(-1)
+    lost = _LOST * (1 - sure[:, 0].amax(-1, keepdim=True))
+    return ((1 - _LOST) * logs.exp() + lost).log()
