@@ -63,7 +63,7 @@ class BodyTracker(OwnPrecisionModule):
     """Tracks one person's whole body through keypoints or silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
-    `advance` some frames at a time, with the same numbers.
+    `advance` (of particle filters) some frames at a time, with the same numbers.
 
     Every method takes the keypoints of any detector, in one camera or more. ``kalman`` is an iterated
     extended Kalman filter over root, rotations, their velocities and bone lengths, in which every keypoint
@@ -467,7 +467,8 @@ class BodyTracker(OwnPrecisionModule):
             The next state, and the `BodyTrack` of these frames.
 
         Raises:
-            ShapeError, InputError, CameraError: as `forward`.
+            ShapeError, InputError, CameraError: as `forward`. InputError: a stream of "kalman", which takes
+            one frame at a time, by `step`.
         """
         names = _stream_names(state, names)
         if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
