@@ -314,6 +314,13 @@ def point_blocks(covs: Float[Tensor, "*batch D D"]) -> Float[Tensor, "*batch P 3
     return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
 
 
+def block_diagonal(blocks: Float[Tensor, "*batch N D D"]) -> Float[Tensor, "*batch ND ND"]:
+    """Return matrices with these blocks on their diagonals."""
+    eye = torch.eye(blocks.shape[-3], dtype=blocks.dtype, device=blocks.device)
+    spread = blocks[..., :, :, None, :] * eye[:, None, :, None]
+    return spread.flatten(-2).flatten(-3, -2)
+
+
 def _multiply(a: Tensor, b: Tensor) -> Tensor:
     """Return A @ B; matmul itself takes 2 us longer to see that neither has to be broadcast."""
     if a.ndim == b.ndim == 3 and a.shape[0] == b.shape[0]:

@@ -25,6 +25,7 @@ from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
+from torchpose.math._gaussian import block_diagonal
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
@@ -484,11 +485,3 @@ def arm_measurements(
     z = measured.uv[:, :, rows].flatten(-2)
     mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
     return z, mask, block_diagonal(measured.cov[..., rows, :, :])
-
-
-def block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
-    """Return matrices with these blocks on their diagonals, Z = 2 N."""
-    n = blocks.shape[-3]
-    eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
-    spread = blocks[..., :, :, None, :] * eye[:, None, :, None]
-    return spread.flatten(-2).flatten(-3, -2)

@@ -21,7 +21,7 @@ from torchpose.filters._memoryless import Wanted, run_with_context
 from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._outside_points import OutsidePoint, with_outside_point
 from torchpose.filters._side_by_side import SideBySide
-from torchpose.math._gaussian import point_blocks
+from torchpose.math._gaussian import block_diagonal, point_blocks
 from torchpose.math._geometric_median import median_columns
 from torchpose.math._rotations import matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
@@ -44,7 +44,6 @@ from torchpose.upper_body._estimator import (
 from torchpose.upper_body._measured_joints import (
     CAMERA_ANGLES,
     MeasuredJoints,
-    block_diagonal,
     pixel_indices,
     upright_cov,
 )

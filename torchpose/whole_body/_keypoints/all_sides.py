@@ -38,9 +38,7 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
 
 def _telling(frames: KeypointFrame) -> KeypointFrame:
     """Return frames [N, C, J], of those in which two cameras see most joints."""
-    told = ((frames.inlier > 0).sum(1) >= 2).sum(-1) >= _LEAST_JOINTS
-    rows = told.nonzero().squeeze(-1)
-    return frames.take(rows[:: max(1, -(-len(rows) // _FRAMES))])
+    return frames.some(((frames.inlier > 0).sum(1) >= 2).sum(-1) >= _LEAST_JOINTS, _FRAMES)
 
 
 def _gains(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:

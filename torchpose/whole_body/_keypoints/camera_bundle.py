@@ -31,6 +31,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     RigMaps,
     Seen,
     Weighed,
+    by_point,
     readings_of,
     squared_errors,
     weigh,
@@ -234,22 +235,12 @@ def _seen(
     in_front = depth > LEAST_DEPTH
     depth = torch.where(in_front, depth, 1.0)[..., None]
     pixels = (X @ rig.matrix.mT)[..., :2] / depth
-    by_joint = _by_point(rig.matrix @ R, pixels, depth)
-    by_point = _by_point(rig.matrix[cameras], pixels[:, cameras], depth[:, cameras])
+    by_joint = by_point(rig.matrix @ R, pixels, depth)
+    by_shift = by_point(rig.matrix[cameras], pixels[:, cameras], depth[:, cameras])
     turned = X[:, cameras] - values[cameras, None, 3:6]
-    by_turn = torch.linalg.cross(turned[..., None, :], by_point)
+    by_turn = torch.linalg.cross(turned[..., None, :], by_shift)
     by_delay = -(by_joint[:, cameras] * velocity[:, None, :, None]).sum(-1, keepdim=True)
-    return Seen(pixels, by_joint, in_front), torch.cat([by_turn, by_point, by_delay], -1)
-
-
-def _by_point(
-    matrix: Float[Tensor, "C 3 3"],
-    pixels: Float[Tensor, "T C J 2"],
-    depth: Float[Tensor, "T C J 1"],
-) -> Float[Tensor, "T C J 2 3"]:
-    """Return the derivative of pixels by points, whose homogeneous pixels are M p + m."""
-    rows = matrix[:, None, :2] - pixels[..., None] * matrix[:, None, 2:]
-    return rows / depth[..., None]
+    return Seen(pixels, by_joint, in_front), torch.cat([by_turn, by_shift, by_delay], -1)
 
 
 def _covariance(

@@ -176,9 +176,7 @@ def _alike(one: _Tried, other: _Tried) -> bool:
 
 def _some(frames: KeypointFrame) -> KeypointFrame:
     """Return frames, few enough, in which two cameras see the person."""
-    told = (frames.inlier > 0).any(-1).sum(-1) >= 2
-    rows = told.nonzero().squeeze(-1)
-    return frames.take(rows[:: max(1, -(-len(rows) // _FRAMES))])
+    return frames.some((frames.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
 
 
 def _repeated(frames: KeypointFrame, count: int) -> KeypointFrame:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
 from torchpose.math._rotations import rotvec_to_matrix
-from torchpose.whole_body._keypoints.joint_triangulation import triangulate_all
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate_without
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     LEAST_DEPTH,
     KeypointFrame,
@@ -145,14 +145,12 @@ def _first_joints(
     rig: CameraRig, frames: KeypointFrame, causes: Causes
 ) -> Float[Tensor, "N T J 3"]:
     """Return joints by the other cameras, or by all where too few see them."""
-    there = frames.inlier > 0
     own = torch.nn.functional.one_hot(causes.camera, len(rig)).bool()
     own = own & causes.free.any(-1, keepdim=True)
-    right = there & ~own[:, None, :, None]
-    right = torch.where(right.sum(2, keepdim=True) >= 2, right, there)
+    count, n_frames = frames.inlier.shape[:2]
     flat = frames.map(lambda value: value.flatten(0, 1))
-    joints = triangulate_all(RigMaps.of(rig), flat, right.flatten(0, 1))
-    return joints.unflatten(0, there.shape[:2])
+    joints = triangulate_without(RigMaps.of(rig), flat, own.repeat_interleave(n_frames, 0))
+    return joints.unflatten(0, (count, n_frames))
 
 
 def _seen(
@@ -192,8 +190,7 @@ def _square(rays: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
 
 def _residuals(frames: KeypointFrame, views: _Views) -> tuple[Tensor, Tensor]:
     """Return residuals [N, T, C, J, 2] of keypoints, and the variances of their noise."""
-    size = 0.5 * views.by_point.square().sum((-2, -1))
-    return frames.pixels - views.pixels, frames.variance + frames.relative * size
+    return frames.pixels - views.pixels, frames.noise(views.by_point)
 
 
 def _equations(

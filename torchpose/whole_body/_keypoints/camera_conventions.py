@@ -74,10 +74,7 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
     if len(rig) == 1:
         return
     flat = frames.map(lambda value: value.flatten(0, 1))
-    told = (flat.inlier > 0).any(-1).sum(-1) >= 2
-    rows = told.nonzero().squeeze(-1)
-    rows = rows[:: max(1, -(-len(rows) // _FRAMES))]
-    some = flat.map(lambda value: value[rows])
+    some = flat.some((flat.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
     both = (some.inlier > 0) & ((some.inlier > 0).sum(1, keepdim=True) >= 2)
     if int(both.sum()) < _LEAST_KEYPOINTS:
         return

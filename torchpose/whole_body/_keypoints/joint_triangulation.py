@@ -36,11 +36,8 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
         both = (there[:, a] & there[:, b])[..., None]
         pair = normal[:, a] + normal[:, b], right[:, a] + right[:, b]
         seen = see(maps, _solved(both[..., None] * pair[0], both * pair[1]))
-        variance = (
-            frame.variance + frame.relative * (seen.by_joint * seen.by_joint).sum((-2, -1)) / 2.0
-        )
         off = seen.pixels - frame.pixels
-        error = (off * off).sum(-1) / variance
+        error = (off * off).sum(-1) / frame.noise(seen.by_joint)
         agree = there & seen.in_front & (error < _AGREE**2)
         score = (
             agree.to(error) - torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
@@ -71,8 +68,7 @@ def agreement_of_each(
     """Return the sums of `agreement` of each element of the batch, and the numbers of its keypoints."""
     chosen, there = agreeing(maps, frame), frame.inlier > 0
     seen = see(maps, triangulate_all(maps, frame, chosen))
-    variance = frame.variance + frame.relative * (seen.by_joint * seen.by_joint).sum((-2, -1)) / 2.0
-    error = (seen.pixels - frame.pixels).square().sum(-1) / variance
+    error = (seen.pixels - frame.pixels).square().sum(-1) / frame.noise(seen.by_joint)
     good = torch.where(chosen, (1 - error / _AGREE**2).clamp_min(0), 0.0)
     both = there & (there.sum(1, keepdim=True) >= 2)
     return torch.where(both, good, 0.0).sum((1, 2)), both.sum((1, 2))
@@ -89,6 +85,19 @@ def triangulate_all(
     normal, right = _normal_equations(maps, frame)
     count = use.to(right)[..., None]
     return _solved((count[..., None] * normal).sum(1), (count * right).sum(1))
+
+
+def triangulate_without(
+    maps: RigMaps, frame: KeypointFrame, left_out: Bool[Tensor, "B C"]
+) -> Float[Tensor, "B J 3"]:
+    """Return joints by the cameras that are not left out, or by all where too few of these see them.
+
+    Args:
+        maps: the cameras. frame: the keypoints. left_out: which cameras.
+    """
+    there = frame.inlier > 0
+    use = there & ~left_out[..., None]
+    return triangulate_all(maps, frame, torch.where(use.sum(1, keepdim=True) >= 2, use, there))
 
 
 def _normal_equations(

@@ -78,6 +78,19 @@ class KeypointFrame(NamedTuple):
         """Return the keypoints of some elements of the batch."""
         return self.map(lambda value: value[index])
 
+    def some(self, chosen: Bool[Tensor, " N"], most: int) -> Self:
+        """Return at most so many of the chosen elements of the batch, evenly spread."""
+        rows = chosen.nonzero().squeeze(-1)
+        return self.take(rows[:: max(1, -(-len(rows) // most))])
+
+    def noise(self, by_joint: Float[Tensor, "... C J 2 3"]) -> Float[Tensor, "... C J"]:
+        """Return the variance of the noise of every keypoint, r + m |A|^2 / 2, pixels squared.
+
+        Args:
+            by_joint: A, the derivative of pixels by the joint; |A|^2 / 2 is about f^2 / depth^2.
+        """
+        return self.variance + self.relative * (0.5 * (by_joint * by_joint).sum((-2, -1)))
+
 
 class Seen(NamedTuple):
     """Holds pixels [B, C, J, 2] of joints, their derivative [B, C, J, 2, 3] and whether they are in front."""
@@ -176,8 +189,17 @@ def see(maps: RigMaps, joints: Float[Tensor, "B J 3"]) -> Seen:
     in_front = depth > LEAST_DEPTH
     depth = torch.where(in_front, depth, 1.0)[..., None]
     pixels = homogeneous[..., :2] / depth
-    rows = maps.matrix[:, None, :2] - pixels[..., None] * maps.matrix[:, None, 2:]
-    return Seen(pixels, rows / depth[..., None], in_front)
+    return Seen(pixels, by_point(maps.matrix, pixels, depth), in_front)
+
+
+def by_point(
+    matrix: Float[Tensor, "C 3 3"],
+    pixels: Float[Tensor, "*batch C J 2"],
+    depth: Float[Tensor, "*batch C J 1"],
+) -> Float[Tensor, "*batch C J 2 3"]:
+    """Return the derivative of pixels by points p, whose homogeneous pixels are M p + m."""
+    rows = matrix[:, None, :2] - pixels[..., None] * matrix[:, None, 2:]
+    return rows / depth[..., None]
 
 
 def weigh(
@@ -202,9 +224,7 @@ def weigh(
         decide: whether keypoints tell about exchanged sides; else the prior alone does.
         width: factor of the noise's variance.
     """
-    size = 0.5 * (seen.by_joint * seen.by_joint).sum((-2, -1))  # about f^2 / depth^2
-    scale = (width * beliefs.scale)[..., None]
-    variance = scale * (readings.variance + readings.relative * size)
+    variance = (width * beliefs.scale)[..., None] * readings.noise(seen.by_joint)
     inlier, there = readings.inlier, readings.inlier > 0.0
     present = there & seen.in_front
     off = readings.pixels - seen.pixels

@@ -221,8 +221,7 @@ def _agreement(
     """Return the log odds of detections as those of triangulated joints against somebody else."""
     known = joints.isfinite().all(-1)
     seen = see(maps, joints.nan_to_num())
-    size = 0.5 * seen.by_joint.square().sum((-2, -1))[:, None]  # [H, 1, C, J]
-    variance = _WIDER * (frame.variance + frame.relative * size)
+    variance = _WIDER * frame.noise(seen.by_joint[:, None])
     square = (frame.pixels - seen.pixels[:, None]).square().sum(-1)
     log_in = -0.5 * square / variance - (2 * math.pi * variance).log()
     outside = torch.log1p(-frame.inlier) - maps.log_area[:, None]

@@ -17,12 +17,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.math._gaussian import block_diagonal
 from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
-from torchpose.whole_body._keypoints.joint_triangulation import triangulate_all
+from torchpose.whole_body._keypoints.joint_triangulation import (
+    triangulate_all,
+    triangulate_without,
+)
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     KeypointFrame,
     RigMaps,
-    Seen,
+    by_point,
     see,
 )
 
@@ -31,6 +35,7 @@ _FREEDOM = 4.0  # nu, of Student's distribution of the errors
 _WIDTHS = (400.0, 400.0, 100.0, 100.0, 25.0, 25.0, 9.0, 4.0, 2.0, *[1.0] * 6)
 _WIDTHS_OF_KNOWN = (9.0, 4.0, 1.0, 1.0)
 _KNOWN = 1e12  # per square radian, the information about cameras that are not turned
+_LEAST_DEPTH = 0.1  # of a turned ray, whose depth is 1 before it is turned
 _JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cameras do
 
 
@@ -103,7 +108,7 @@ def find_turns(
     eye = torch.eye(3).to(rays)
     if known is None:
         turn, widths = eye.expand(*free.shape, 3, 3), _WIDTHS
-        joints = _first_joints(frame, free, maps)
+        joints = triangulate_without(maps, frame, free & ~free.all(-1, keepdim=True))
     else:
         turn, widths = known, _WIDTHS_OF_KNOWN
         joints = triangulate_all(maps, turned(frame, turn, maps), frame.inlier > 0)
@@ -128,16 +133,6 @@ def find_turns(
     return Turns(matrix, spent + narrowed, misfit, errors, trust / (1 + ratio))
 
 
-def _first_joints(
-    frame: KeypointFrame, free: Bool[Tensor, "N C"], maps: RigMaps
-) -> Float[Tensor, "N J 3"]:
-    """Return joints by the cameras that are not turned, or by all where too few see them."""
-    there = frame.inlier > 0
-    right = there & ~(free & ~free.all(-1, keepdim=True))[..., None]
-    right = torch.where(right.sum(1, keepdim=True) >= 2, right, there)
-    return triangulate_all(maps, frame, right)
-
-
 def _equations(
     frame: KeypointFrame,
     rays: Float[Tensor, "N C J 3"],
@@ -154,7 +149,7 @@ def _equations(
     pixels, by_ray = _pixels(rays, maps)
     seen = see(maps, joints)
     A, off = seen.by_joint, pixels - seen.pixels
-    variance, square = width * _variance(frame, seen), off.square().sum(-1)
+    variance, square = width * frame.noise(seen.by_joint), off.square().sum(-1)
     trust = frame.inlier * seen.in_front
     root = (trust / (variance + square / _FREEDOM)).sqrt()[..., None]
     r, A = root * off, root[..., None] * A
@@ -165,7 +160,7 @@ def _equations(
     b = A.mT @ r.transpose(1, 2).flatten(2)[..., None]
     solved = torch.linalg.solve_triangular(chol, torch.cat([F, b], -1), upper=False).flatten(1, 2)
     Y, y = solved[..., :-1], solved[..., -1:]
-    S = _block_diagonal(T.mT @ T) - Y.mT @ Y
+    S = block_diagonal(T.mT @ T) - Y.mT @ Y
     g = (T.mT @ r.flatten(2)[..., None]).flatten(1) - (Y.mT @ y).squeeze(-1)
     return chol, F, b, S, g
 
@@ -179,12 +174,7 @@ def _errors(
     """Return errors of turned keypoints over the standard deviations of their noise, and their trust."""
     seen = see(maps, joints)
     off = pixels - seen.pixels
-    return off / _variance(frame, seen).sqrt()[..., None], frame.inlier * seen.in_front
-
-
-def _variance(frame: KeypointFrame, seen: Seen) -> Float[Tensor, "N C J"]:
-    """Return the variances of the noise of keypoints."""
-    return frame.variance + frame.relative * 0.5 * seen.by_joint.square().sum((-2, -1))
+    return off / frame.noise(seen.by_joint).sqrt()[..., None], frame.inlier * seen.in_front
 
 
 def _rays(frame: KeypointFrame, maps: RigMaps) -> Float[Tensor, "*batch C J 3"]:
@@ -200,13 +190,6 @@ def _pixels(
     """Return the pixels of rays, and their derivatives."""
     homogeneous = rays @ maps.matrix.mT
     depth = homogeneous[..., 2:]
-    depth = torch.where(depth > 0.1, depth, 0.1)
+    depth = torch.where(depth > _LEAST_DEPTH, depth, _LEAST_DEPTH)
     pixels = homogeneous[..., :2] / depth
-    rows = maps.matrix[:, None, :2] - pixels[..., None] * maps.matrix[:, None, 2:]
-    return pixels, rows / depth[..., None]
-
-
-def _block_diagonal(blocks: Float[Tensor, "N C 3 3"]) -> Float[Tensor, "N C3 C3"]:
-    """Return matrices with blocks on their diagonals."""
-    eye = torch.eye(blocks.shape[1]).to(blocks)
-    return (eye[:, None, :, None] * blocks[:, :, :, None]).flatten(-2).flatten(1, 2)
+    return pixels, by_point(maps.matrix, pixels, depth)
