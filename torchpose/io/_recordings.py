@@ -27,7 +27,8 @@ from torchpose.io._formats.axes import (
     heading,
     note_on_lying,
 )
-from torchpose.io._formats.kinect_csv import ROW_LENGTHS, header_joints, is_row, read_kinect_csv
+from torchpose.io._formats.joint_tables import header_joints
+from torchpose.io._formats.kinect_csv import ROW_LENGTHS, is_row, read_kinect_csv
 from torchpose.io._formats.mocap_files import read_bvh, read_c3d
 from torchpose.io._formats.raw_recording import (
     RawRecording,

@@ -9,7 +9,7 @@ import numpy as np
 from torchpose._core.reading import read_json, read_text, reading
 from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError
-from torchpose.io._formats.kinect_csv import dropped_frames, read_kinect_csv
+from torchpose.io._formats.kinect_csv import read_kinect_csv
 from torchpose.io._formats.raw_recording import (
     LEVEL_WEIGHTS,
     SENSOR_WEIGHTS,
@@ -17,7 +17,7 @@ from torchpose.io._formats.raw_recording import (
     RawRecording,
     join_bodies,
 )
-from torchpose.io._formats.table_rows import KINECT_FPS, split_row
+from torchpose.io._formats.table_rows import KINECT_FPS, dropped_frames, split_row
 from torchpose.skeleton._joint_sets import SKELETONS
 
 _KINECT_V1_NAMES = SKELETONS["kinect-v1-20"].joints

@@ -1,4 +1,4 @@
-"""Split the rows of tables into cells, and read their time stamps."""
+"""Split the rows of tables into cells, and read their time stamps and frame rates."""
 
 import contextlib
 import datetime
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchpose.errors import FileFormatError
+from torchpose.io._formats.raw_recording import frame_ranges
 
 KINECT_FPS = 30.0
 KINECT_TICK = 1e-7  # Kinect v2's time stamps count 100 ns
@@ -21,6 +22,7 @@ _SLOWEST, FASTEST = 4.0, 250.0  # frames per second that a recording may have
 _TIME = re.compile(
     r"(date|frame|relative|elapsed)?_?time(_?stamp)?(_(s|sec|ms|us|usec|ns|iso|utc))?"
 )
+_GAP = 1.5  # median steps
 _MARKS = (";", "\t", ",")
 
 
@@ -150,3 +152,36 @@ def _mean_step(steps: np.ndarray, counts: np.ndarray | None) -> float:
     each = steps / counts
     frames = counts * np.rint(each / usual_step(each)).clip(min=1)
     return float(steps.sum() / frames.sum())
+
+
+def dropped_frames(stamps: np.ndarray, by: str = "time stamps") -> list[str]:
+    """Return a note on frames that the sensor left out, by steps of more than 1.5 times the median one."""
+    steps = np.diff(stamps)
+    if not len(steps):
+        return []
+    ratio = steps / np.median(steps)
+    after = np.flatnonzero(ratio > _GAP)
+    if not len(after):
+        return []
+    count = int(np.round(ratio[after] - 1).sum())
+    return [
+        f"frames that are not in the file, by its {by}: {count}, after "
+        f"{frame_ranges(after.tolist())}"
+    ]
+
+
+def stated_rate(path: Path, facts: dict[str, str], otherwise: float | None) -> float | None:
+    """Return the frame rate that a file states among its facts, or another one.
+
+    Raises:
+        FileFormatError: it is no positive number.
+    """
+    if "fps" not in facts:
+        return otherwise
+    try:
+        fps = float(facts["fps"])
+    except ValueError:
+        fps = math.nan
+    if not 0 < fps < math.inf:
+        raise FileFormatError(f"{path}: fps must be one positive number, got {facts['fps']!r}")
+    return fps
