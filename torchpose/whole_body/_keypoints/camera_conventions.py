@@ -79,10 +79,28 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
     if int(both.sum()) < _LEAST_KEYPOINTS:
         return
     given = float(agreement(filter.maps, some))
+    found = _better(rig, filter, some, given)
+    if not found:
+        return
+    best, convention = max(found, key=lambda pair: pair[0])
+    ordered = float(agreement_of_orders(filter.maps, some)[1].max())
+    if ordered > best:
+        return  # a note tells of the order
+    or_order = ", or inputs are in another order than the cameras" if ordered > best - _TIE else ""
+    raise CameraError(
+        f"cameras agree on {100 * given:.0f} % of the keypoints as they are given, and on {100 * best:.0f} % "
+        f"if {convention.said}{or_order}; {convention.advice}"
+    )
+
+
+def _better(
+    rig: CameraRig, filter: BodyKalmanFilter, some: KeypointFrame, given: float
+) -> list[tuple[float, Convention]]:
+    """Return the conventions in which cameras agree far better than as given, each after how well they do."""
     human = _is_human(filter, filter.maps, some)
     above, upside_down = _trunks(some)
     if human and given > _SURE and not upside_down:
-        return
+        return []
     found = []
     least = WELL_OF_TWO if len(rig) == 2 else WELL
     conventions = (
@@ -101,17 +119,7 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
         more = _LITTLE if upside_down and convention.tilts else MORE
         if fits > max(least, given + more if human else 0.0) and _is_human(filter, maps, moved):
             found.append((fits, convention))
-    if not found:
-        return
-    best, convention = max(found, key=lambda pair: pair[0])
-    ordered = float(agreement_of_orders(filter.maps, some)[1].max())
-    if ordered > best:
-        return  # a note tells of the order
-    or_order = ", or inputs are in another order than the cameras" if ordered > best - _TIE else ""
-    raise CameraError(
-        f"cameras agree on {100 * given:.0f} % of the keypoints as they are given, and on {100 * best:.0f} % "
-        f"if {convention.said}{or_order}; {convention.advice}"
-    )
+    return found
 
 
 def _is_human(filter: BodyKalmanFilter, maps: RigMaps, some: KeypointFrame) -> bool:
