@@ -82,7 +82,7 @@ def count_parts(
     rig.check_images("silhouettes", silhouettes.shape)
     batch, n_positions = tuple(parts.start.shape[:-3]), parts.start.shape[-3]
     n, strip = math.prod(batch), Strip(*silhouettes.shape)
-    which = which_silhouette(n, _shared(silhouettes, batch), silhouettes.before)
+    which = which_silhouette(n, math.prod(silhouettes.leading(batch, "parts")), silhouettes.before)
     before = silhouettes.before.to(parts.start.device)
     mine = flatten_limbs(parts)
     theirs = None if opposing is None else _union(opposing, batch)
@@ -193,14 +193,3 @@ def _union(opposing: Limbs, batch: tuple[int, ...]) -> Limbs:
     radii = opposing.radii.expand(*opposing.start.shape[:-1], 2)
     flat = (x.flatten(-3, -2).flatten(0, -3) for x in (opposing.start, opposing.end, radii))
     return Limbs(*flat)
-
-
-def _shared(silhouettes: PreparedSilhouettes, batch: tuple[int, ...]) -> int:
-    """Return the number of silhouettes of the batch; 1 if it shares one."""
-    leading = tuple(silhouettes.area.shape[:-1])
-    if batch[: len(leading)] != leading:
-        raise ShapeError(
-            f"silhouettes must have the leading dimensions of the parts, {list(batch)} or the first "
-            f"of them, got {list(leading)} before [C, H, W]"
-        )
-    return math.prod(leading)

@@ -64,6 +64,23 @@ class PreparedSilhouettes(NamedTuple):
     area: Int[Tensor, "*batch C"]
     shape: tuple[int, int, int]
 
+    def leading(self, batch: tuple[int, ...], of: str) -> tuple[int, ...]:
+        """Return the leading dimensions, the first ones of a batch or none.
+
+        Args:
+            batch: of what is compared. of: its name in messages.
+
+        Raises:
+            ShapeError: they do not fit.
+        """
+        leading = tuple(self.area.shape[:-1])
+        if batch[: len(leading)] != leading:
+            raise ShapeError(
+                f"silhouettes must have the leading dimensions of the {of}, {list(batch)} or the first "
+                f"of them, got {list(leading)} before [C, H, W]"
+            )
+        return leading
+
 
 def prepare_silhouettes(silhouettes: Tensor) -> PreparedSilhouettes:
     """Return running sums of silhouettes along their rows.
@@ -126,12 +143,7 @@ def count_pixels(
         silhouettes = prepare_silhouettes(silhouettes)
     rig.check_images("silhouettes", silhouettes.shape)
     batch = tuple(limbs.start.shape[:-2])
-    shared = tuple(silhouettes.area.shape[:-1])
-    if batch[: len(shared)] != shared:
-        raise ShapeError(
-            f"silhouettes must have the leading dimensions of the states, [{list(batch)}] or the "
-            f"first of them, got {list(shared)} before [C, H, W]"
-        )
+    shared = silhouettes.leading(batch, "states")
     flat = flatten_limbs(limbs)
     n, strip = len(flat.start), Strip(*silhouettes.shape)
     before = silhouettes.before.to(flat.start.device)
