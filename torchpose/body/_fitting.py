@@ -11,6 +11,7 @@ Joint positions leave some quantities undetermined. The fit takes for:
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -375,15 +376,7 @@ def _known_joints(skeleton: BodySkeleton, joints: Tensor) -> Bool[Tensor, " J"]:
     check_shape("joints", joints, ["T", len(skeleton.names), 3])
     if joints.shape[0] == 0:
         raise InputError("a fit needs at least one frame, got none")
-    there = torch.isfinite(joints).all(-1)
-    gap = there.any(0) & ~there
-    if bool(gap.any()):
-        frame, joint = (int(i) for i in torch.nonzero(gap)[0])
-        raise InputError(
-            f"joint {skeleton.names[joint]!r} is missing in frame {frame} ({int(gap.sum())} such "
-            "gaps); fill or cut them out: only a joint that is missing in all frames may be NaN"
-        )
-    known = there.all(0)
+    known = joints_without_gaps(skeleton.names, joints)
     needed = [j for j, rigid in enumerate(_roles(skeleton).rigid) if (rigid or j == 0)]
     missing = [skeleton.names[j] for j in needed if not bool(known[j])]
     if missing:
@@ -392,6 +385,23 @@ def _known_joints(skeleton: BodySkeleton, joints: Tensor) -> Bool[Tensor, " J"]:
         above = [skeleton.parents[j] for j in level]
         known[list(level)] &= known[above]
     return known
+
+
+def joints_without_gaps(names: Sequence[str], joints: Float[Tensor, "T J 3"]) -> Bool[Tensor, " J"]:
+    """Return which joints are there in all frames.
+
+    Raises:
+        InputError: one is missing in some frames only.
+    """
+    there = torch.isfinite(joints).all(-1)
+    gap = there.any(0) & ~there
+    if bool(gap.any()):
+        frame, joint = (int(i) for i in torch.nonzero(gap)[0])
+        raise InputError(
+            f"joint {names[joint]!r} is missing in frame {frame} ({int(gap.sum())} such "
+            "gaps); fill or cut them out: only a joint that is missing in all frames may be NaN"
+        )
+    return there.all(0)
 
 
 def _unit(vector: Tensor) -> Tensor:

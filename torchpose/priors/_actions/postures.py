@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
-from torchpose.body._fitting import swing_parts
+from torchpose.body._fitting import joints_without_gaps, swing_parts
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError, ShapeError, SkeletonError
@@ -315,13 +315,5 @@ def _known(joints: Tensor) -> Tensor:
             f"joints must have shape [..., 15, 3] in the order of BODY_15, got "
             f"{list(joints.shape)}; body_joints picks them out of a joint set"
         )
-    there = torch.isfinite(joints).all(-1).reshape(-1, joints.shape[-2])
-    gap = there.any(0) & ~there
-    if bool(gap.any()):
-        frame, joint = (int(i) for i in torch.nonzero(gap)[0])
-        raise InputError(
-            f"joint {BODY_15.names[joint]!r} is missing in frame {frame} ({int(gap.sum())} such "
-            "gaps); fill or cut them out: only a joint that is missing in all frames may be NaN"
-        )
-    all_there = there.all(0)
-    return all_there[_STARTS] & all_there[_ENDS]
+    there = joints_without_gaps(BODY_15.names, joints.reshape(-1, *joints.shape[-2:]))
+    return there[_STARTS] & there[_ENDS]
