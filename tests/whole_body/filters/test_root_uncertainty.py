@@ -20,7 +20,6 @@ from torchpose.whole_body._filters.limb_observations import (
     part_log_likelihood,
     parts_log_weight,
 )
-from torchpose.whole_body._filters.root_uncertainty import PUBLISHED
 from torchpose.whole_body._silhouettes.limb_counts import PartCounts
 from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes
 
@@ -277,7 +276,8 @@ def test_survival_that_leaves_one_hypothesis_is_refused():
 
 
 def test_the_published_form_is_there_by_name():
-    filter_ = tracker(**PUBLISHED, survival_rate=None)
+    published = {"normalisation": "published", "observation_sharpness": 1.0}
+    filter_ = tracker(**published, survival_per_second=0.01, survival_rate=None)
     assert filter_.survival_rate == pytest.approx(0.926, abs=1e-3)  # section 8: 0.93 at 60 Hz
     assert filter_.normalisation == "published" and filter_.observation_sharpness == 1
 

@@ -60,12 +60,6 @@ from torchpose.whole_body._keypoints.particle_likelihood import (
 )
 
 WEIGHTINGS = ("parts", "body")
-PUBLISHED: dict[str, Any] = {
-    "survival_per_second": 0.01,
-    "normalisation": "published",
-    "observation_sharpness": 1.0,
-}
-"""Options of the tracker as published, where they differ from the defaults."""
 
 _SURVIVAL = 0.1  # a frame
 _POINTS = 7  # places of every part, which together cost as much as so many whole bodies
