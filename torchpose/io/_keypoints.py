@@ -219,6 +219,34 @@ def _to_csv(data: Keypoints) -> str:
 
 def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -> Keypoints:
     points, names = raw.keypoints, raw.names
+    _check_points(path, points, names)
+    filled = is_filled(points)
+    missing = np.isnan(points).any(-1) | filled
+    if raw.confidence is not None:
+        confidence = _check_confidence(path, raw.confidence, points.shape[:2])
+        filled &= confidence > 0
+        missing |= confidence == 0
+        confidence = np.where(missing, 0.0, confidence)
+    if missing.all():
+        raise NobodySeenError(
+            f"{path}: no keypoint is measured in any of {counted(len(points), 'frame')}"
+        )
+    size = _check_size(path, raw.image_size)
+    points, scaled = in_pixels(path, points, missing, size or image_size)
+    notes = (*raw.notes, *scaled, *_note_of_filled(int(filled.sum())))
+    fps, neck = _rate_of(path, raw), _neck_of(path, raw)
+    keypoints = Keypoints(
+        torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
+        None if raw.confidence is None else torch.from_numpy(confidence), fps,
+        _check_matrix(path, raw.K), size, neck, path,
+        notes=notes,
+        n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
+        first_frame=raw.first_frame,
+    )  # fmt: skip
+    return _with_joints(keypoints) if lacks_joints(names) else keypoints
+
+
+def _check_points(path: Path, points: np.ndarray, names: Sequence[str]) -> None:
     if points.ndim != 3 or points.shape[1:] != (len(names), 2):
         raise FileFormatError(
             f"{path}: keypoints must have shape [T, {len(names)}, 2] for {len(names)} names, got "
@@ -236,39 +264,23 @@ def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -
         canonical_names(names)
     except SkeletonError as error:
         raise SkeletonError(f"{path}: {error}") from error
-    filled = is_filled(points)
-    missing = np.isnan(points).any(-1) | filled
-    if raw.confidence is not None:
-        confidence = _check_confidence(path, raw.confidence, points.shape[:2])
-        filled &= confidence > 0
-        missing |= confidence == 0
-        confidence = np.where(missing, 0.0, confidence)
-    if missing.all():
-        raise NobodySeenError(
-            f"{path}: no keypoint is measured in any of {counted(len(points), 'frame')}"
-        )
-    size = _check_size(path, raw.image_size)
-    points, scaled = in_pixels(path, points, missing, size or image_size)
-    notes = (*raw.notes, *scaled, *_note_of_filled(int(filled.sum())))
+
+
+def _rate_of(path: Path, raw: RawKeypoints) -> float | None:
     try:
-        fps = None if raw.fps is None else check_rate("fps", raw.fps)
+        return None if raw.fps is None else check_rate("fps", raw.fps)
     except InputError as error:
         raise FileFormatError(f"{path}: {error}") from error
+
+
+def _neck_of(path: Path, raw: RawKeypoints) -> str | None:
+    """Return the kind of neck that a file states, or that its names have."""
     if raw.neck is not None and raw.neck not in NECK_KINDS:
         raise FileFormatError(
             f"{path}: neck must be one of {', '.join(NECK_KINDS)}, got {raw.neck!r}"
         )
-    skeleton = identify_skeleton(names)
-    keypoints = Keypoints(
-        torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
-        None if raw.confidence is None else torch.from_numpy(confidence), fps,
-        _check_matrix(path, raw.K), size,
-        raw.neck or (neck_of_detectors(names) if skeleton is None else skeleton.neck), path,
-        notes=notes,
-        n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
-        first_frame=raw.first_frame,
-    )  # fmt: skip
-    return _with_joints(keypoints) if lacks_joints(names) else keypoints
+    skeleton = identify_skeleton(raw.names)
+    return raw.neck or (neck_of_detectors(raw.names) if skeleton is None else skeleton.neck)
 
 
 def _with_joints(data: Keypoints) -> Keypoints:
