@@ -67,11 +67,13 @@ def add_pose_classes(
     for group, scored in groups.items():
         for number, name in enumerate(POSE_CLASSES):
             chosen = scored.classes == number
-            row: list[float] = [100 * float(chosen.double().mean())]
-            for errors in (scored.filtered, scored.smoothed):
-                for joints in (_HANDS, _ELBOWS):
-                    row.append(100 * float(errors[:, list(joints)][chosen].double().nanmean()))
-            table.add(f"{group}, {name}" if len(groups) > 1 else name, row)
+            row = [
+                100 * float(errors[:, list(joints)][chosen].double().nanmean())
+                for errors in (scored.filtered, scored.smoothed)
+                for joints in (_HANDS, _ELBOWS)
+            ]
+            share = 100 * float(chosen.double().mean())
+            table.add(f"{group}, {name}" if len(groups) > 1 else name, [share, *row])
     return table
 
 

@@ -157,19 +157,25 @@ def run_jobs(
                 found.append(_run(job, folder, progress))
                 bar.update(1)
             return found
-        pool = ProcessPoolExecutor(
-            workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
-        )
-        with pool:
-            futures = [pool.submit(_run, job, folder, False) for job in jobs]
-            try:
-                for done in as_completed(futures):
-                    done.result()
-                    bar.update(1)
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-            return [future.result() for future in futures]
+        return _run_in_processes(jobs, folder, workers, bar)
+
+
+def _run_in_processes(
+    jobs: Sequence[Job], folder: Path, workers: int, bar: tqdm
+) -> list[dict[str, Scored]]:
+    pool = ProcessPoolExecutor(
+        workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+    )
+    with pool:
+        futures = [pool.submit(_run, job, folder, False) for job in jobs]
+        try:
+            for done in as_completed(futures):
+                done.result()
+                bar.update(1)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        return [future.result() for future in futures]
 
 
 def _run(job: Job, folder: Path, progress: bool) -> dict[str, Scored]:

@@ -278,14 +278,7 @@ def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None
     for ax, (part, limbs) in zip(panels, parts.items(), strict=True):
         style_axes(ax, "threshold (fraction of the limb's true length)", title=part)
         for name, curve in curves.items():
-            share = curve.overall
-            if limbs is not None:
-                if curve.per_limb.shape[0] != 4:
-                    raise InputError(
-                        f"by_limb needs the four limbs of ARM_LIMBS, got {curve.per_limb.shape[0]}"
-                    )
-                n = curve.counts[limbs].to(curve.per_limb.dtype)
-                share = (curve.per_limb[limbs].nan_to_num() * n[:, None]).sum(0) / n.sum()
+            share = curve.overall if limbs is None else _share_of(curve, limbs)
             ax.plot(
                 to_numpy(curve.thresholds), 100 * to_numpy(share), linewidth=1.9, **styles[name]
             )
@@ -294,6 +287,16 @@ def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None
     panels[0].set_ylabel("correct limbs (%)", fontsize=NORMAL, color=INK)
     add_legend(figure, _line_entries(styles))
     return figure
+
+
+def _share_of(curve: PCP, limbs: list[int]) -> Tensor:
+    """Return the share of correct parts among some of the four limbs of the arms."""
+    if curve.per_limb.shape[0] != 4:
+        raise InputError(
+            f"by_limb needs the four limbs of ARM_LIMBS, got {curve.per_limb.shape[0]}"
+        )
+    n = curve.counts[limbs].to(curve.per_limb.dtype)
+    return (curve.per_limb[limbs].nan_to_num() * n[:, None]).sum(0) / n.sum()
 
 
 def plot_reliability(

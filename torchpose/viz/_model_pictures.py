@@ -272,22 +272,16 @@ def plot_action_space(
     shown = min(n_dimensions, space.n_dimensions)
     figure = new_figure(2.4 * shown + 0.6, 5.2, title or _action_title(space))
     axes = figure.subplots(2, shown, sharex=True, sharey="col", squeeze=False)
-    stages = (synchronised.before, synchronised.after)
-    for row, (stage, name) in enumerate(
-        zip(stages, ("length normalised", "synchronised"), strict=True)
-    ):
-        mean, std = stage.mean(0), stage.std(0)
-        if row == 1:
-            mean, std = space.performance, space.std
-        for d in range(shown):
-            ax = style_axes(
-                axes[row, d], "posture k" if row else "", f"{name}\ndegrees" if d == 0 else "",
-                "" if row else f"dimension {d + 1}",
-            )  # fmt: skip
-            _draw(ax, stage[..., d], mean[:, d], deviations * std[:, d])
-            if row == 1:
-                for key in synchronised.key_frames[1:-1]:
-                    ax.axvline(key, color=MUTED, linewidth=0.8, linestyle=":")
+    before, after = synchronised.before, synchronised.after
+    for d in range(shown):
+        ax = style_axes(
+            axes[0, d], "", "length normalised\ndegrees" if d == 0 else "", f"dimension {d + 1}"
+        )
+        _draw(ax, before[..., d], before.mean(0)[:, d], deviations * before.std(0)[:, d])
+        ax = style_axes(axes[1, d], "posture k", "synchronised\ndegrees" if d == 0 else "")
+        _draw(ax, after[..., d], space.performance[:, d], deviations * space.std[:, d])
+        for key in synchronised.key_frames[1:-1]:
+            ax.axvline(key, color=MUTED, linewidth=0.8, linestyle=":")
     add_legend(figure, _action_legend(deviations))
     return figure
 

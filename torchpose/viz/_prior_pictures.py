@@ -183,17 +183,8 @@ def _draw_components(
     heaviest = block[0].weight
     for ax, component in zip(panels.flat, block, strict=False):
         share = component.weight / heaviest
-        for pick, shift in ((_FRONT, 0.0), (_SIDE, aside)):
-            offset = torch.tensor([shift, 0.0], dtype=torch.float64)
-            for side, mean in component.means.items():
-                if pick == _SIDE and side == "right" and len(component.means) > 1:
-                    continue  # the mirror image looks the same from the side
-                _draw_arms(ax, component.draws[side][..., pick] + offset, side)
-                colors = [SIDE_COLORS[side]] * 3 + [MIDDLE] * 2
-                draw_skeleton(
-                    ax, mean[:, pick] + offset, colors=colors, limbs=ARM_LIMBS,
-                    linewidth=1.0 + 1.4 * share, alpha=0.35 + 0.65 * share,
-                )  # fmt: skip
+        _draw_view(ax, component, _FRONT, 0.0, share)
+        _draw_view(ax, component, _SIDE, aside, share)
         ax.set_aspect("equal")
         ax.set(
             xlim=(float(low[0]), float(high[0]) + size[2]),
@@ -201,6 +192,22 @@ def _draw_components(
         )
         ax.plot(2 * [float(high[0])], [float(low[1]), float(high[1])], color=GRID, linewidth=0.8)
         weight_bar(ax, component.weight, share)
+
+
+def _draw_view(
+    ax: Axes, component: _Component, pick: tuple[int, int], shift: float, share: float
+) -> None:
+    """Draw a component from the front or the side, so far to the right; the heavier, the thicker."""
+    offset = torch.tensor([shift, 0.0], dtype=torch.float64)
+    for side, mean in component.means.items():
+        if pick == _SIDE and side == "right" and len(component.means) > 1:
+            continue  # the mirror image looks the same from the side
+        _draw_arms(ax, component.draws[side][..., pick] + offset, side)
+        colors = [SIDE_COLORS[side]] * 3 + [MIDDLE] * 2
+        draw_skeleton(
+            ax, mean[:, pick] + offset, colors=colors, limbs=ARM_LIMBS,
+            linewidth=1.0 + 1.4 * share, alpha=0.35 + 0.65 * share,
+        )  # fmt: skip
 
 
 def _draw_arms(ax: Axes, arms: Float[Tensor, "N 5 2"], side: str, alpha: float = 0.22) -> None:
