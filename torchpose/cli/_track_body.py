@@ -2,7 +2,6 @@
 
 import sys
 import time
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -207,17 +206,29 @@ def run(
     if by_keypoints:
         options = {**tracker, **options}
         return _run_on_keypoints(job, inputs, found, given.values, options, finds_tilt)
-    with ExitStack() as stack:
-        drawn = ["overlay.png"] if job.pictures else []
-        results = stack.enter_context(body_results(job, found, overlay, drawn))
-        recordings = Recordings(
-            inputs, found, rows, fps=fps, delays=delays, background=background,
-            ignore_still=ignore_still,
-        )  # fmt: skip
-        with recordings:
+    return _run_on_silhouettes(job, inputs, found, given, tracker, options)
+
+
+def _run_on_silhouettes(
+    job: BodyJob,
+    inputs: list[str],
+    cameras: "list[PinholeCamera]",
+    given: Given,
+    tracker: dict[str, Any],
+    options: dict[str, Any],
+) -> int:
+    """Track by silhouettes, and return the exit code."""
+    values, drawn = given.values, ["overlay.png"] if job.pictures else []
+    with body_results(job, cameras, job.overlay, drawn) as results:
+        of_videos = ("fps", "delays", "background", "ignore_still")
+        with Recordings(
+            inputs, cameras, values["rows"], **{name: values[name] for name in of_videos}
+        ) as recordings:
             start = time.perf_counter()
-            body_tracker = _tracker(recordings, method, tracker, options)
-            poses = _track(recordings, body_tracker, initial_pose, facing, seed)
+            body_tracker = _tracker(recordings, values["method"], tracker, options)
+            poses = _track(
+                recordings, body_tracker, values["initial_pose"], values["facing"], values["seed"]
+            )
             seconds = time.perf_counter() - start
             if poses is None:
                 print(
@@ -227,8 +238,8 @@ def run(
                 return 1
             written = results.commit(write_people(job, results.stage, [poses]))
             shown: list[Path] = []
-            if overlay or job.pictures:
-                shown, _ = draw(recordings, [poses], results.stage, overlay, job.pictures)
+            if job.overlay or job.pictures:
+                shown, _ = draw(recordings, [poses], results.stage, job.overlay, job.pictures)
         facts = _facts(given, body_tracker, recordings, poses, seconds)
         shown += write_page(recordings.views[0].source, [poses], facts, results.stage)
         written += results.commit(shown)

@@ -83,12 +83,12 @@ def track_video(
         if not people:
             detector = options["detector"]
             return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
+        method = f"{people[0].track.method}{smoothing_text(settings.smoothing)}"
         facts = {
             "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
             "prior": prior.info.name or settings.prior,
             "camera": camera_text(camera),
-            "method": people[0].track.method
-            + f"{smoothing_text(settings.smoothing)}, {_measured_by(options)}",
+            "method": f"{method}, {_measured_by(options)}",
             "speed": f"{n_read / max(seconds, 1e-9):.0f} frames a second, without drawing",
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]

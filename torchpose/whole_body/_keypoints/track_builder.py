@@ -81,18 +81,11 @@ class TrackBuilder:
         live = poses.started.shape[1] == 1
         begun = 0 if live else int(poses.started[b].int().argmax())
         poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
-        standing: dict[str, Tensor] = {}
-        of_depths = self.tracker.poses if self.tracker.poses.side_by_side else self.tracker.only
-        if of_depths is not None:
-            standing[COVARIANCE_FROM_PELVIS] = of_depths.covariance_from_pelvis(poses)
-        if feet is not None:
-            own = mapped(lambda value: value[b, begun:], feet)
-            standing |= dict(zip(DETAILS_OF_FEET, own, strict=True))
-        if bool(is_turned(poses.turn).any()):
-            standing[CAMERA_TURN] = poses.turn
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
+        if feet is not None:
+            feet = mapped(lambda value: value[b, begun:], feet)
         rigid = _rigid_body(bones, ~poses.coasting)
         state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
         notes: tuple[str, ...] = ()
@@ -112,14 +105,27 @@ class TrackBuilder:
             self.fps,
             notes=notes,
             first_frame=first_frame,
-            details={
-                "inlier": poses.inlier,
-                "exchanged": poses.exchanged,
-                "bone_lengths": bones.norm(dim=-1),
-                **standing,
-            },
+            details=self._details(poses, bones, feet),
             method=KEYPOINT_METHOD,
         )
+
+    def _details(
+        self, poses: KeypointPoses, bones: Float[Tensor, "T J 3"], feet: FootPoses | None
+    ) -> dict[str, Tensor]:
+        """Return what the track of a person holds beside the poses."""
+        details = {
+            "inlier": poses.inlier,
+            "exchanged": poses.exchanged,
+            "bone_lengths": bones.norm(dim=-1),
+        }
+        of_depths = self.tracker.poses if self.tracker.poses.side_by_side else self.tracker.only
+        if of_depths is not None:
+            details[COVARIANCE_FROM_PELVIS] = of_depths.covariance_from_pelvis(poses)
+        if feet is not None:
+            details |= dict(zip(DETAILS_OF_FEET, feet, strict=True))
+        if bool(is_turned(poses.turn).any()):
+            details[CAMERA_TURN] = poses.turn
+        return details
 
     def _state_std(self, cov: Float[Tensor, "T N N"]) -> Float[Tensor, "T 36"]:
         """Return standard deviations in the units of a state: metres, and sines of half angles."""
