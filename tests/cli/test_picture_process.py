@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="none is started
 
 @pytest.fixture(autouse=True)
 def _matplotlib_is_not_here(monkeypatch):
-    monkeypatch.setattr(_picture_process, "_pays", lambda: True)
+    monkeypatch.setattr(_picture_process, "_is_sooner", lambda: True)
 
 
 def test_it_draws_the_same():

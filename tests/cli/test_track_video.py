@@ -319,7 +319,7 @@ def test_poses_and_pictures_are_kept_when_the_overlay_does_not_fit(clip, track, 
     """Another process draws the pictures."""
     monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
     if sys.platform != "win32":
-        monkeypatch.setattr("torchpose.cli._picture_process._pays", lambda: True)
+        monkeypatch.setattr("torchpose.cli._picture_process._is_sooner", lambda: True)
         monkeypatch.delattr("torchpose.cli._track_output.save_pictures")
     done, out = track(clip[0], "--pictures", "true")
     assert done.code == 2 and "No space left" in done.err

@@ -378,7 +378,7 @@ def test_motion_capture_added_to_any_data_sets(data, tmp_path):
 
 def test_no_head_of_a_tested_person_is_learnt_from(data):
     split = cross_dataset._crossed(cross_dataset._read([data], (), "cross"), (), 1)
-    sets = cross_dataset._alike(split, 0)
+    sets = cross_dataset._with_same_joints(split, 0)
     tested = {r.person_id for group in split["UTD"].tested.values() for r in group}
     assert sets.completion.persons and not set(sets.completion.persons) & tested
     # the mean head is for tests; training recordings have residuals, and nothing else differs

@@ -13,7 +13,7 @@ from torchpose.demo import performer
 from torchpose.errors import InputError, PriorError
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.learning._recipes import UpperBodyRecipe, calibration
-from torchpose.learning._recipes.calibration import MODES, _seen, track_held_out
+from torchpose.learning._recipes.calibration import MODES, _noisy_keypoints, track_held_out
 from torchpose.learning._samplers import all_samples
 from torchpose.learning._training import arm_sources, collect_poses, short_paths
 from torchpose.math import euler_to_matrix as rotate
@@ -119,7 +119,7 @@ def test_held_out_persons_are_tracked_at_the_rates_of_their_recordings(monkeypat
         wanted = torch.cat([part[mode].errors for part in apart])
         torch.testing.assert_close(both[mode].errors, wanted)
     test = recipe.poses([fast])
-    keypoints, truth, inside = _seen(prior, [test.joints], 0)
+    keypoints, truth, inside = _noisy_keypoints(prior, [test.joints], 0)
     track = UpperBodyTracker(
         prior, prior.camera, calibrated=False, fps=60.0, method="window-mixture"
     )

@@ -52,7 +52,7 @@ def demo_video(
     scores = {name: score(track, truth) for name, track in tracks.items()}
     scores[MEAN_POSE] = score_mean_pose(prior, truth)
     print(report(scores, "measured in the video: head and neck from the face, hands and elbows"))
-    print(f"\n{_seen(person)}; {n_frames / elapsed:.0f} frames a second, drawing apart")
+    print(f"\n{_measured_shares(person)}; {n_frames / elapsed:.0f} frames a second, drawing apart")
     overlay = stage / "overlay.mp4"
     with open_video(clip) as source:
         write_overlay(overlay, source, people, n_frames)
@@ -89,7 +89,7 @@ def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
     return smoothed(person, smoother, tracker.measurer.names, tracker.gap)
 
 
-def _seen(person: "TrackedPerson") -> str:
+def _measured_shares(person: "TrackedPerson") -> str:
     hands = person.keypoints[:, 2:4].isfinite().all(-1).double().mean(0).tolist()
     return (
         f"measured in {100 * hands[0]:.0f} % (left hand) and {100 * hands[1]:.0f} % of the frames"

@@ -121,7 +121,9 @@ def run(
     everything = read_recordings(found, axes)
     unread = notes_on_unread_files(recordings, found)
     pictures = pictures_possible(pictures)
-    kept, said, facts = _curated(_without(everything, without or []), curation if curate else None)
+    kept, said, facts = _curated(
+        _without_persons(everything, without or []), curation if curate else None
+    )
     words = {"name": name or file.stem, "licence": licence, "command": given.line(out)}
     with fit_results(file, given.files(), pictures) as results:
         print(said, *(f"note     {n}" for n in unread), sep="\n", flush=True)
@@ -183,7 +185,7 @@ def _curated(
 ) -> tuple[list["Recording"], str, dict[str, Any]]:
     """Return curated recordings, a description of the omissions, and facts about them for the card."""
     if settings is None:
-        return recordings, f"read     {_count(recordings)}", {}
+        return recordings, f"read     {_counts(recordings)}", {}
     from torchpose.learning._curation import curate
     from torchpose.learning._curation.curate import CurationSettings
 
@@ -192,7 +194,7 @@ def _curated(
     return curated.recordings, report.text(_SHOWN_DROPS), report.for_prior()
 
 
-def _without(recordings: list["Recording"], persons: list[str]) -> list["Recording"]:
+def _without_persons(recordings: list["Recording"], persons: list[str]) -> list["Recording"]:
     """Return the recordings of everybody else."""
     from torchpose.learning._curation.splits import pick_persons
 
@@ -225,7 +227,7 @@ def _check_options(given: Given) -> None:
         given.refuse(_OF_MIXTURES, "new mixtures, and --noise-of keeps those of a prior")
 
 
-def _count(recordings: list["Recording"]) -> str:
+def _counts(recordings: list["Recording"]) -> str:
     persons = len({r.person_id for r in recordings})
     frames = sum(len(r) for r in recordings)
     return (

@@ -27,7 +27,7 @@ class PictureProcess:
 
     def __init__(self, wanted: bool) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        if not wanted or not _pays():
+        if not wanted or not _is_sooner():
             return
         with contextlib.suppress(OSError):
             self._process = subprocess.Popen(
@@ -55,7 +55,7 @@ class PictureProcess:
             self._process.communicate()
 
 
-def _pays() -> bool:
+def _is_sooner() -> bool:
     """Return whether another process draws sooner than this one."""
     from torchpose.video._other_process import cores
 

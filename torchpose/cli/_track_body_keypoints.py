@@ -111,7 +111,7 @@ def track_keypoints(
         wanted = overlay or job.pictures or settings.silhouettes is not None
         films = stack.enter_context(_films(shown if wanted else None, cameras, settings))
         results = stack.enter_context(
-            body_results(job, cameras, overlay, _more(job, shown is not None, settings))
+            body_results(job, cameras, overlay, _further_files(job, shown is not None, settings))
         )
         keypoints = read_body_keypoints(
             inputs, cameras, detector=settings.detector, fps=settings.fps, delays=settings.delays,
@@ -172,7 +172,7 @@ def _nobody(keypoints: BodyKeypoints) -> str:
     return "nobody was seen for long enough by cameras that agree"
 
 
-def _more(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
+def _further_files(job: BodyJob, films: bool, settings: KeypointSettings) -> list[str]:
     """Return the names of further files: pictures, cameras."""
     pictures = [*(["overlay.png"] if films else []), "skeleton.png"] if job.pictures else []
     return (
@@ -308,11 +308,12 @@ def _facts(
         + smoothing_text("full" if settings.smoothing == "full" else None),
         "body": _body_text(people, settings),
         **{name: fact for name, fact in agreement.items() if fact},
-        "speed": f"{_count(keypoints, people) / max(seconds, 1e-9):.1f} frames a second, without drawing",
+        "speed": f"{_number_of_frames(keypoints, people) / max(seconds, 1e-9):.1f} frames a second, "
+        "without drawing",
     }
 
 
-def _count(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> int:
+def _number_of_frames(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> int:
     """Return the number of frames that were tracked."""
     return len(people[0]) if len(people) == 1 else len(keypoints.points)
 

@@ -167,7 +167,7 @@ def run(
         return run_jobs(jobs, folder, workers, progress)
 
     if part != "added":
-        sets = _alike(_crossed(read, tested, thin), seed)
+        sets = _with_same_joints(_crossed(read, tested, thin), seed)
         _report_cross(report, out, sets, scored(_cross_jobs(sets, scoring, common)))
     if part != "cross":
         left_out = _left_out(read, thin, seed, mocap_share)
@@ -215,7 +215,7 @@ def _report_added(
 # --- data sets ------------------------------------------------------------------------------------
 
 
-def _all(persons: Mapping[str, list[Recording]]) -> list[Recording]:
+def _recordings_of(persons: Mapping[str, list[Recording]]) -> list[Recording]:
     return [recording for group in persons.values() for recording in group]
 
 
@@ -319,7 +319,7 @@ def _crossed(read: _DataSets, tested: Sequence[str], thin: int) -> dict[str, _Sp
     return {name: _split(own, _held_out(own, tested), name) for name, own in sets.items()}
 
 
-def _alike(sets: Mapping[str, _Split], seed: int) -> _Alike:
+def _with_same_joints(sets: Mapping[str, _Split], seed: int) -> _Alike:
     """Return the data sets with the same joints: heads made up, and wrists as hands, if one lacks them.
 
     Raises:
@@ -327,7 +327,7 @@ def _alike(sets: Mapping[str, _Split], seed: int) -> _Alike:
     """
 
     def kinds(name: str) -> list[Any]:
-        recordings = [r for part in sets[name] for r in _all(part)]
+        recordings = [r for part in sets[name] for r in _recordings_of(part)]
         return [upper_body_indices(names) for names in {tuple(r.names) for r in recordings}]
 
     lacking = [name for name in sets if any(kind.head is None for kind in kinds(name))]
@@ -335,7 +335,7 @@ def _alike(sets: Mapping[str, _Split], seed: int) -> _Alike:
     if not donors:
         raise InputError(f"heads are missing in all data sets: {', '.join(lacking)}")
     wrists = bool(lacking) or any(kind.hand == "wrist" for name in sets for kind in kinds(name))
-    learnt = [r for name in donors for r in _all(sets[name].train)]
+    learnt = [r for name in donors for r in _recordings_of(sets[name].train)]
     completion = learn_completion(learnt, ("head",)) if lacking else None
 
     def convert(name: str, persons: _Persons, source: torch.Generator | None) -> _Persons:
@@ -378,7 +378,9 @@ def _cross_jobs(sets: _Alike, scoring: ScoreSettings, common: dict[str, Any]) ->
             if other != name
             for k, v in labelled(other, split.train).items()
         }
-        jobs.append(Job(f"trained on {name}", _all(train), held | far, test=scoring, **common))
+        jobs.append(
+            Job(f"trained on {name}", _recordings_of(train), held | far, test=scoring, **common)
+        )
     return jobs
 
 
@@ -399,12 +401,12 @@ def _left_out(read: _DataSets, thin: int, seed: int, share: float) -> dict[str, 
         labels, extra = ("alone", f"with {next(iter(mocap))}", "with all motion capture"), {}
     held = {name: (own, {n: p for n, p in sets.items() if n != name}) for name, own in sets.items()}
     pieces = {
-        name: [piece for r in _all(persons) for piece in facing_pieces(r)]
+        name: [piece for r in _recordings_of(persons) for piece in facing_pieces(r)]
         for name, persons in mocap.items()
     }
     found = {}
     for name, (tests, left) in (held | extra).items():
-        base = [r for persons in left.values() for r in _all(persons)]
+        base = [r for persons in left.values() for r in _recordings_of(persons)]
         completion = learn_completion(base)
         generator = torch.Generator().manual_seed(seed)
         made = [[complete(r, completion, generator) for r in own] for own in pieces.values()]

@@ -105,7 +105,7 @@ def run(
     if quick:
         persons = {name: group[::5] for name, group in persons.items()}
         counts, n_subsets, n_own = tuple(c for c in counts if c in counts[:2]), 2, min(1, n_own)
-    others, more_notes = _others(further, len(persons) - 1, max(counts))
+    others, more_notes = _further_persons(further, len(persons) - 1, max(counts))
     refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
     settings = fit_settings(
         "learning-curve", seed, quick, n_components, window_components, window_samples, 0
@@ -219,7 +219,7 @@ def _doubling(most: int) -> tuple[int, ...]:
     return tuple(sorted({min(2**i, most) for i in range(most.bit_length() + 1)}))
 
 
-def _others(
+def _further_persons(
     folders: Sequence[Path], most: int, count: int
 ) -> tuple[dict[str, list[Recording]], list[str]]:
     """Return the missing number of further training persons, and notes on their recordings."""

@@ -127,17 +127,17 @@ class GainGraph:
         return Edge(target, inverse, gain.white, gain.log_norm, predicted, mended, jitter)
 
     def _target(self, node: int, pattern: int, updated: Tensor) -> int:
-        if _same(updated, self.nodes[node]):
+        if _is_settled(updated, self.nodes[node]):
             self._steady[pattern] = node
             return node
         known = self._steady.get(pattern)
-        if known is not None and _same(updated, self.nodes[known]):
+        if known is not None and _is_settled(updated, self.nodes[known]):
             return known
         self.nodes.append(updated)
         return len(self.nodes) - 1
 
 
-def _same(a: Tensor, b: Tensor) -> bool:
+def _is_settled(a: Tensor, b: Tensor) -> bool:
     deviation = b.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     scale = deviation[..., :, None] * deviation[..., None, :]
     return bool(((a - b).abs() <= _SETTLED * scale).all())

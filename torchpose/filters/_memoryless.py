@@ -93,7 +93,7 @@ def conditioned_groups(
     """
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
-    for same in _alike(mask, noise):
+    for same in _rows_by_setting(mask, noise):
         own_noise = frames.cov if noise is None else noise[same[0]]
         for rows in same.split(_RECOMPUTED_FRAMES):
             group = _Group(rows, z[rows], mask[same[:1]], own_noise)
@@ -285,8 +285,8 @@ def _groups(
         each = frames.cov.expand(len(z), -1, -1) if noise is None else noise
         yield _Group(torch.arange(len(z), device=z.device), z, mask, each)
         return
-    alike = _alike(mask, noise)
-    if noise is not None and not _pays(model, noise, mask, len(alike), wanted):
+    alike = _rows_by_setting(mask, noise)
+    if noise is not None and not _sharing_pays(model, noise, mask, len(alike), wanted):
         yield from _groups_of_own(z, mask, noise)
         return
     for same in alike:
@@ -298,7 +298,7 @@ def _groups(
             yield _Group(rows, own, own_mask, own_noise)
 
 
-def _alike(
+def _rows_by_setting(
     mask: Bool[Tensor, "*A N Z"], noise: Float[Tensor, "*A N Z Z"] | None
 ) -> Sequence[Tensor]:
     """Return the rows of frames that measure the same dimensions with the same noise, set by set."""
@@ -314,7 +314,7 @@ def _alike(
     return group.argsort(stable=True).split(torch.bincount(group).tolist())
 
 
-def _pays(
+def _sharing_pays(
     model: Tracks,
     noise: Float[Tensor, "*A N Z Z"],
     mask: Bool[Tensor, "*A N Z"],

@@ -157,7 +157,7 @@ def _search(weights: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> I
     """Return the particle whose share of the cumulative weights holds each position in [0, 1)."""
     edges = _edges(weights)
     dead = ~torch.isfinite(edges[:, -1:])
-    index = _place(edges, torch.where(dead, 0.0, positions.clamp_max(BELOW_ONE)))
+    index = _first_above(edges, torch.where(dead, 0.0, positions.clamp_max(BELOW_ONE)))
     steps = torch.arange(index.shape[1], device=index.device).clamp_max(weights.shape[1] - 1)
     return torch.where(dead, steps, index)
 
@@ -167,7 +167,7 @@ def ancestors(weights: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) ->
 
     Of weights that are all zero, or hold NaN, it may be any.
     """
-    return _place(_edges(weights), positions)
+    return _first_above(_edges(weights), positions)
 
 
 def _edges(weights: Float[Tensor, "B N"]) -> Float[Tensor, "B N"]:
@@ -176,7 +176,9 @@ def _edges(weights: Float[Tensor, "B N"]) -> Float[Tensor, "B N"]:
     return edges / edges[:, -1:]
 
 
-def _place(edges: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> Int[Tensor, "B n"]:
+def _first_above(
+    edges: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]
+) -> Int[Tensor, "B n"]:
     """Return the first edge above each position; right=True steps over zero weights."""
     index = torch.searchsorted(edges, positions.contiguous(), right=True)
     return index.clamp_max(edges.shape[1] - 1)

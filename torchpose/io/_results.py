@@ -107,7 +107,7 @@ class ResultsFolder:
     def _refuse_inputs(self) -> None:
         for path in self._present():
             for given in self._inputs:
-                if _same(path, given):
+                if _same_file(path, given):
                     raise OutputError(
                         f"{path}: is an input of this run, which would write over it; choose another "
                         "--out"
@@ -304,7 +304,7 @@ def _free_folder(folder: Path, names: Sequence[str]) -> Path:
     return free
 
 
-def _same(path: Path, other: Path) -> bool:
+def _same_file(path: Path, other: Path) -> bool:
     try:
         return os.path.samefile(path, other)
     except OSError:

@@ -52,7 +52,7 @@ def _lags(fps: float) -> tuple[int, int]:
 def fit_decay(articulation: Articulation, sets: MotionSets) -> Float[Tensor, " V"]:
     """Return the decay of the velocities, E[v_t v_(t + k)] ~ exp(-decay k h), k > 0."""
     decays = torch.stack([_decay(articulation, own) for own in sets.values()])
-    return _alike(articulation, _geometric_mean(decays, _told(articulation, sets)))
+    return _symmetric(articulation, _geometric_mean(decays, _known_of_sets(articulation, sets)))
 
 
 def fit_drift(
@@ -66,7 +66,7 @@ def fit_drift(
     Args:
         articulation: of the bodies. sets: recordings. decay: of the velocities.
     """
-    told = _told(articulation, sets).double()
+    told = _known_of_sets(articulation, sets).double()
     pairs = [_changes_of_set(articulation, own, decay) for own in sets.values()]
     means = torch.stack([x.mean(0) for x, _ in pairs]).mean(0)
     means[0] = 0.0
@@ -95,8 +95,8 @@ def fit_accelerations(
         articulation: of the bodies. sets: recordings. left: of each set (`accelerations_left`).
     """
     powers = torch.stack([mean_squares(changes) for changes in left])
-    power = _geometric_mean(powers, _told(articulation, sets))
-    return _alike(articulation, power).sqrt().clamp_min(_LEAST_ACCELERATION)
+    power = _geometric_mean(powers, _known_of_sets(articulation, sets))
+    return _symmetric(articulation, power).sqrt().clamp_min(_LEAST_ACCELERATION)
 
 
 def _changes_of_set(
@@ -178,7 +178,7 @@ def fit_correlation(
     """
     mirror, n = mirror_of(articulation), articulation.n_pose
     found = torch.zeros(n, n, dtype=torch.float64)
-    for told, changes in zip(_told(articulation, sets)[:, 3:], left, strict=True):
+    for told, changes in zip(_known_of_sets(articulation, sets)[:, 3:], left, strict=True):
         told = (told & told[mirror.columns]).double()
         cov = changes[:, 3:].mT @ changes[:, 3:]
         cov = cov + cov[mirror.columns][:, mirror.columns] * torch.outer(mirror.sign, mirror.sign)
@@ -220,7 +220,7 @@ def accelerations_left(
     return torch.cat(clipped(changes))
 
 
-def _told(articulation: Articulation, sets: MotionSets) -> Bool[Tensor, "K V"]:
+def _known_of_sets(articulation: Articulation, sets: MotionSets) -> Bool[Tensor, "K V"]:
     """Return which columns of position and angles each set tells."""
     return torch.stack([known_columns(articulation, own) for own in sets.values()])
 
@@ -230,7 +230,7 @@ def _geometric_mean(values: Float[Tensor, "K V"], told: Bool[Tensor, "K V"]) -> 
     return (torch.where(told, values.log(), 0).sum(0) / told.sum(0)).exp()
 
 
-def _alike(articulation: Articulation, values: Float[Tensor, " V"]) -> Tensor:
+def _symmetric(articulation: Articulation, values: Float[Tensor, " V"]) -> Tensor:
     """Return values that are the same in all directions and on both sides."""
     position, angles = values[:3].mean().expand(3), values[3:]
     return torch.cat([position, (angles * angles[mirror_of(articulation).columns]).sqrt()])

@@ -259,7 +259,7 @@ def arm_sources(
                 f"no frame has all five joints of the {side} arm (hand, elbow, shoulder, head, "
                 "neck); the prior needs recordings that do"
             )
-        count = _count(len(points), n_samples, views_per_pose)
+        count = _number_of_samples(len(points), n_samples, views_per_pose)
         own_seed = derived_seed(seed, f"poses {side}")
         sources[side] = ArmSource(
             matrix, view_range, rotation_order, count, own_seed, False, points, weight
@@ -362,7 +362,7 @@ def _centred(joints: Tensor, centre: str) -> Tensor:
     return joints - joints[:, joint : joint + 1]
 
 
-def _count(n: int, n_samples: int | None, views_per_pose: int | None) -> int:
+def _number_of_samples(n: int, n_samples: int | None, views_per_pose: int | None) -> int:
     if views_per_pose is not None:
         n_samples = n * views_per_pose
     count = DEFAULT_SAMPLES if n_samples is None else n_samples

@@ -269,7 +269,7 @@ class FaceTracker(nn.Module):
             mean=mean, cov=cov, age=tracks.age + 1, unseen=tracks.unseen + 1, frame=tracks.frame + 1
         )
         lasting = mean[:, 2] >= _LEAST
-        return predicted if bool(lasting.all()) else _some(predicted, lasting)
+        return predicted if bool(lasting.all()) else _take(predicted, lasting)
 
     def update(self, tracks: FaceTracks, found: Float[Tensor, "n 3"]) -> FaceTracks:
         """Update predicted tracks with the detections (x, y, size) of their frame; start and end tracks."""
@@ -310,7 +310,7 @@ class FaceTracker(nn.Module):
         return torch.diag_embed((self.std * size[:, None]).square().expand(-1, 3))
 
 
-def _some(tracks: FaceTracks, rows: Bool[Tensor, " N"]) -> FaceTracks:
+def _take(tracks: FaceTracks, rows: Bool[Tensor, " N"]) -> FaceTracks:
     """Return some of the tracks."""
     fields = (value[rows] if isinstance(value, Tensor) else value for value in tracks)
     return FaceTracks(*fields)  # type: ignore[arg-type]

@@ -96,7 +96,7 @@ class HandPrior(nn.Module):
 def _arm_table(mixture: GaussianMixture, focal: tuple[float, float]) -> Float[Tensor, "3 h w"]:
     weights, means, covs = _offsets(mixture, focal)
     spread = covs[:, :2, :2] + _SMOOTH**2 * torch.eye(2, dtype=covs.dtype)
-    density, elbow = _density_and_elbow(_places(), weights, means, covs[:, 2:, :2], spread)
+    density, elbow = _density_and_elbow(_cell_places(), weights, means, covs[:, 2:, :2], spread)
     average = (weights[:, None] * means[:, 2:]).sum(0)
     elbow = (elbow + _VAGUE * average) / (density + _VAGUE)[:, None]
     area = _SIZE[0] * _SIZE[1] * _STEP**2
@@ -104,7 +104,7 @@ def _arm_table(mixture: GaussianMixture, focal: tuple[float, float]) -> Float[Te
     return torch.cat([density.log()[:, None], elbow], 1).T.reshape(3, *_SIZE)
 
 
-def _places() -> Float[Tensor, "P 2"]:
+def _cell_places() -> Float[Tensor, "P 2"]:
     x = _LEFT + _STEP * torch.arange(_SIZE[1], dtype=torch.float64)
     y = _TOP + _STEP * torch.arange(_SIZE[0], dtype=torch.float64)
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).reshape(-1, 2)

@@ -228,7 +228,7 @@ class MediaPipePose(_Task):
         pixels = flat[..., :2] * flat.new_tensor([image.shape[1], image.shape[0]])
         points, visibility, _ = derive_joints(pixels, flat[..., 2], LANDMARKS)
         joints3d = torch.tensor(world, dtype=torch.float64).reshape(-1, len(LANDMARKS), 3)
-        return PoseLandmarks(points, _given(visibility), joints3d)
+        return PoseLandmarks(points, _require_visibility(visibility), joints3d)
 
     def of_one(self, found: PoseLandmarks) -> tuple[Tensor, Tensor]:
         """Return the keypoints of the first person.
@@ -244,7 +244,7 @@ class MediaPipePose(_Task):
         return torch.full((1, len(self.names), 2), torch.nan), torch.zeros(1, len(self.names))
 
 
-def _given(tensor: Tensor | None) -> Tensor:
+def _require_visibility(tensor: Tensor | None) -> Tensor:
     if tensor is None:
         raise InputError("expected a visibility of every landmark, got none")
     return tensor

@@ -238,13 +238,15 @@ class SkinModel(nn.Module):
     def _smoothed(self, counts: Tensor) -> Tensor:
         """Return the shares of the colours [B, 3, 8, 32, 32], each axis smoothed by a product with a band."""
         smooth = counts.view(-1, BINS[2]) @ self.smooth2
-        smooth = _each(self.smooth1, smooth.view(-1, BINS[1], BINS[2]))
-        smooth = _each(self.smooth0, smooth.view(-1, BINS[0], BINS[1] * BINS[2]))
+        smooth = _times_each(self.smooth1, smooth.view(-1, BINS[1], BINS[2]))
+        smooth = _times_each(self.smooth0, smooth.view(-1, BINS[0], BINS[1] * BINS[2]))
         smooth = smooth.view(*counts.shape[:2], *BINS)
         return smooth / smooth.sum((2, 3, 4), keepdim=True).clamp_min(1e-6)
 
 
-def _each(matrix: Float[Tensor, "r r"], values: Float[Tensor, "N r c"]) -> Float[Tensor, "N r c"]:
+def _times_each(
+    matrix: Float[Tensor, "r r"], values: Float[Tensor, "N r c"]
+) -> Float[Tensor, "N r c"]:
     """Return the product of a matrix with each of the others; `@` would copy these."""
     return matrix.expand(len(values), -1, -1).bmm(values)
 

@@ -194,12 +194,12 @@ class Skeleton:
         return replace(self, joints=tuple(joints), parents=parents)
 
 
-def _both(template: str) -> str:
+def _of_both_sides(template: str) -> str:
     return f"{template.format('left')} {template.format('right')}"
 
 
 _KINECT_V1 = "hip_center spine shoulder_center head " + " ".join(
-    _both(t)
+    _of_both_sides(t)
     for t in (
         "{0}_shoulder {0}_elbow {0}_wrist {0}_hand",
         "{0}_hip {0}_knee {0}_ankle {0}_foot",
@@ -218,9 +218,9 @@ _AZURE = (
 )
 _MHAD = (
     "hip_center "
-    + _both("{0}_hip {0}_knee {0}_ankle {0}_toe")
+    + _of_both_sides("{0}_hip {0}_knee {0}_ankle {0}_toe")
     + " neck "
-    + _both("{0}_shoulder {0}_elbow {0}_wrist")
+    + _of_both_sides("{0}_shoulder {0}_elbow {0}_wrist")
 )
 _CMU_ASF = (
     "root lhipjoint rhipjoint lowerback upperback thorax lowerneck lclavicle rclavicle rhumerus "
@@ -229,15 +229,15 @@ _CMU_ASF = (
 )
 _CMU_ACTIONS = (
     "root "
-    + _both("{0}_hip {0}_knee {0}_ankle {0}_foot {0}_toe")
+    + _of_both_sides("{0}_hip {0}_knee {0}_ankle {0}_foot {0}_toe")
     + " lowerback upperback thorax lowerneck upperneck head "
-    + _both("{0}_shoulder {0}_elbow {0}_wrist")
+    + _of_both_sides("{0}_shoulder {0}_elbow {0}_wrist")
 )
 _HUMANEVA = (
     "pelvis thorax "
-    + _both("{0}_shoulder {0}_elbow {0}_wrist")
+    + _of_both_sides("{0}_shoulder {0}_elbow {0}_wrist")
     + " "
-    + _both("{0}_hip {0}_knee {0}_ankle")
+    + _of_both_sides("{0}_hip {0}_knee {0}_ankle")
     + " head"
 )
 _POSE2SIM = (

@@ -466,12 +466,12 @@ class ArticulatedFilter(Estimator):
         power = power if fresh is None else power.masked_fill(fresh, 1.0)
         size, farther = follow_size(state.seen_size, frame.torso, self.every / self.model.rate)
         belief, roots, fits = self.root.weigh(
-            state.root, frame, last, state.sizes, power, fresh, _some(farther)
+            state.root, frame, last, state.sizes, power, fresh, _none_if_nobody(farther)
         )
         starts = state.starts
         if starts is not None and fresh is not None and fits is not None:
             left = (starts - 1).masked_fill(fits, 0)
-            starts = _some(torch.where(fresh, left, starts))
+            starts = _none_if_nobody(torch.where(fresh, left, starts))
         moments = self.grid.moments(belief)
         return state._replace(
             root=belief, roots=roots, seen_size=size, moments=moments, starts=starts
@@ -485,7 +485,7 @@ class ArticulatedFilter(Estimator):
             return None, None
         there = frame.limbs.flatten(1).any(1) & (frame.torso.sum(1) > 1)
         fresh = there & (state.starts > 0)
-        return _some(fresh), _some(fresh & (state.starts < self.starts))
+        return _none_if_nobody(fresh), _none_if_nobody(fresh & (state.starts < self.starts))
 
     def _without_past(
         self, state: ArticulatedState, chosen: Bool[Tensor, " B"]
@@ -548,7 +548,7 @@ class ArticulatedFilter(Estimator):
         return estimates_of(poses, batch_size, self.optics.matrix, self.lengths.names)
 
 
-def _some(chosen: Tensor) -> Tensor | None:
+def _none_if_nobody(chosen: Tensor) -> Tensor | None:
     """Return the same; None if it is false or 0 for everybody."""
     return chosen if bool(chosen.any()) else None
 

@@ -31,7 +31,7 @@ def outlier_notes(
         )
         outliers = outliers & inside[..., None]
         exchanged = exchanged & inside if isinstance(exchanged, Tensor) else exchanged
-    counts, frames, said = outliers.flatten(0, 1).sum(0).tolist(), _count(exchanged), []
+    counts, frames, said = outliers.flatten(0, 1).sum(0).tolist(), _number_of(exchanged), []
     if any(counts):
         joints = [f"{name} {n}" for name, n in zip(UPPER_BODY, counts, strict=True) if n]
         said.append(f"{counted(sum(counts), 'keypoint')} {_TAKEN}: {', '.join(joints)}")
@@ -51,5 +51,5 @@ def exchanged_frames(notes: Iterable[str]) -> int:
     return sum(int(match[1]) for match in found if match)
 
 
-def _count(frames: Bool[Tensor, "B T"] | int) -> int:
+def _number_of(frames: Bool[Tensor, "B T"] | int) -> int:
     return int(frames.sum()) if isinstance(frames, Tensor) else frames

@@ -298,7 +298,7 @@ class SinglePoses(Estimator):
                 warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
                 filters[side], out = self.filter(side, joints).advance(
                     state.filters[side],
-                    *self._given(arm, joints, measured),
+                    *self._measured_by(arm, joints, measured),
                     generator=state.generators[side],
                     return_cov=True,
                     progress=progress,
@@ -323,7 +323,7 @@ class SinglePoses(Estimator):
         measured, view = self._see(measured)
         for side, arm in ARMS.items():
             model = self.filter(side, joints[side])
-            z, mask, cov = self._given(arm, joints[side], measured)
+            z, mask, cov = self._measured_by(arm, joints[side], measured)
             if smoothing is None:
                 own = arm_generators[side]
                 out = model(
@@ -356,7 +356,7 @@ class SinglePoses(Estimator):
             rotation, ones, torch.zeros_like(uv[..., 0, :])
         )
 
-    def _given(
+    def _measured_by(
         self, arm: tuple[int, ...], joints: tuple[str, ...], measured: MeasuredJoints
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return what an arm's filter measures: its joints, then roll and pitch of the camera if known."""

@@ -180,7 +180,7 @@ class WindowMixture(Estimator):
             model = self._filters(sides, own)
             frames = self._frames(model, seen, sides, own, lengths)
             out, context = self._filtered(model, frames, sides[0], own, point, progress)
-            arms += _each(in_double(out), batch)
+            arms += _split_filters(in_double(out), batch)
             contexts += context.split(batch)
         told = tuple(arm[:_N_LIMB] if self.of_limbs else arm for arm in ARMS.values())
         left, right = _beyond_context(arms, contexts, seen, told)
@@ -420,7 +420,7 @@ def _rows_of_arms(sides: tuple[str, ...], joints: tuple[str, ...]) -> tuple[int,
     return tuple(row for side in sides for row in _rows(side, joints))
 
 
-def _each(out: FilterOutput, batch_size: int) -> list[FilterOutput]:
+def _split_filters(out: FilterOutput, batch_size: int) -> list[FilterOutput]:
     """Return the estimates of each of some filters that ran side by side."""
     parts = ([None] * (len(out.mean) // batch_size) if value is None else value.split(batch_size)
              for value in out)  # fmt: skip

@@ -58,9 +58,12 @@ def measured_of(block: Sequence[Found], number: int, n_joints: int) -> Measured:
         for row in torch.nonzero(frame.person == number).flatten()[:1]:
             found.keypoints[t], found.absent[t] = frame.keypoints[row], frame.absent[row]
             if isinstance(frame, FrameKeypoints):
-                _given(found.confidence)[t], found.size[t] = frame.confidence[row], frame.sizes[row]
+                _require_measured(found.confidence)[t], found.size[t] = (
+                    frame.confidence[row],
+                    frame.sizes[row],
+                )
             else:
-                _given(found.covariance)[t] = frame.covariance[row]
+                _require_measured(found.covariance)[t] = frame.covariance[row]
                 found.size[t] = frame.faces[row, 2]
     return found
 
@@ -81,7 +84,7 @@ def unmeasured(n_frames: int, n_joints: int, detected: bool = False) -> Measured
     return Measured(points, eye.repeat(n_frames, n_joints, 1, 1), size, None, unknown)
 
 
-def _given(values: Tensor | None) -> Tensor:
+def _require_measured(values: Tensor | None) -> Tensor:
     if values is None:
         raise InputError("expected measurements with covariances, got keypoints of a detector")
     return values
@@ -197,7 +200,7 @@ class PersonStream(nn.Module):
                 absent=absent_for(self.tracker, measured.absent),
             )
             return state._replace(stream=stream), poses, measured
-        given = (measured.keypoints, _given(measured.covariance), measured.absent)
+        given = (measured.keypoints, _require_measured(measured.covariance), measured.absent)
         both = [torch.stack([one, one[:, self.exchanged]]) for one in given]
         stream, poses = self.tracker.advance(
             state.stream, both[0], covariance=both[1],

@@ -192,7 +192,7 @@ class SilhouetteMeasurer:
             image = _tensor(small)
             found = self._background(image) == PixelKind.FOREGROUND
             if self._moved is not None:
-                found &= ~(self._moved.still & _alike(image, self._moved.colour))
+                found &= ~(self._moved.still & _is_near(image, self._moved.colour))
             return found.numpy()
         return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
 
@@ -242,10 +242,10 @@ class _Moved(NamedTuple):
 
 def _find_moved(frames: UInt8[Tensor, "N 3 H W"]) -> _Moved:
     colour = frames.median(0).values
-    return _Moved(colour, _alike(frames, colour).double().mean(0) >= _STILL)
+    return _Moved(colour, _is_near(frames, colour).double().mean(0) >= _STILL)
 
 
-def _alike(images: Tensor, colour: Tensor) -> Tensor:
+def _is_near(images: Tensor, colour: Tensor) -> Tensor:
     return (images.int() - colour.int()).abs().amax(-3) <= _SAME
 
 

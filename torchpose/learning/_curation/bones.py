@@ -94,8 +94,8 @@ def find_wrong_joints(
     score = share + 0.01 * count
     farther = wrong & (score[:, _FARTHER] >= score[:, _NEARER])
     blamed = torch.zeros(joints.shape[:2], dtype=torch.bool)
-    blamed.index_put_(_places(farther, _FARTHER), torch.tensor(True))
-    blamed.index_put_(_places(wrong & ~farther, _NEARER), torch.tensor(True))
+    blamed.index_put_(_frames_and_joints(farther, _FARTHER), torch.tensor(True))
+    blamed.index_put_(_frames_and_joints(wrong & ~farther, _NEARER), torch.tensor(True))
     nobody = wrong.sum(1) > _HALF * there.sum(1)
     return WrongJoints(blamed, nobody)
 
@@ -129,7 +129,7 @@ def _usual(joints: Tensor) -> PersonBones:
     return PersonBones(median, _TO_STD * (length / median).log().abs().nanmedian(0).values)
 
 
-def _places(bones: Bool[Tensor, "T 7"], ends: Tensor) -> tuple[Tensor, Tensor]:
+def _frames_and_joints(bones: Bool[Tensor, "T 7"], ends: Tensor) -> tuple[Tensor, Tensor]:
     frame, bone = torch.nonzero(bones, as_tuple=True)
     return frame, ends[bone]
 

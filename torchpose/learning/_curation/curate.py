@@ -161,7 +161,7 @@ def _without_companions(
     if settings.companions:
         return recordings
     why = "nobody says who this is"
-    drops += [_whole("companion", r, why) for r in recordings if r.companion]
+    drops += [_drop_whole("companion", r, why) for r in recordings if r.companion]
     return [r for r in recordings if not r.companion]
 
 
@@ -179,13 +179,13 @@ def _without_duplicates(
             kept = found.first + found.second - shorter
             copies.add(shorter)
             why = f"also in {label(recordings[kept])}"
-            drops.append(_whole("duplicate", recordings[shorter], why))
+            drops.append(_drop_whole("duplicate", recordings[shorter], why))
     return [r for i, r in enumerate(recordings) if i not in copies]
 
 
 def _without_jumps(recording: Recording, speeds: tuple[float, ...], drops: list[Drop]) -> Recording:
     jumps = find_jumps(recording.upper_body().joints, recording.fps or _RATE, speeds)
-    return _without(recording, jumps, "jump", drops)
+    return _mark_missing(recording, jumps, "jump", drops)
 
 
 def _without_wrong_bones(
@@ -199,16 +199,16 @@ def _without_wrong_bones(
         bones = usual[recording.person_id, body.neck]
         size = human_size(bones, shoulders.get(recording.person_id))
         if size:
-            drops.append(_whole("no person's size", recording, size))
+            drops.append(_drop_whole("no person's size", recording, size))
             continue
         found = find_wrong_joints(body.joints, bones, ratios)
         there = measured(body.joints)
         nobody = (found.frames[:, None] & there).any(1)
         if bool(nobody.any()):
-            drops.append(_some("no body", recording, "", nobody))
+            drops.append(_drop_some("no body", recording, "", nobody))
         recording = with_missing(recording, nobody[:, None] & there)
         wrong = found.joints & ~nobody[:, None]
-        kept.append(_without(recording, wrong, "bone length", drops))
+        kept.append(_mark_missing(recording, wrong, "bone length", drops))
     return kept
 
 
@@ -223,14 +223,14 @@ def _without_short_persons(
         person = recording.person_id
         if person in short:
             why = f"{counted(frames[person], 'frame')} of this person with a whole arm, {least} are needed"
-            drops.append(_whole("too few frames", recording, why))
+            drops.append(_drop_whole("too few frames", recording, why))
     return [r for r in recordings if r.person_id not in short]
 
 
-def _without(recording: Recording, wrong: Tensor, reason: str, drops: list[Drop]) -> Recording:
+def _mark_missing(recording: Recording, wrong: Tensor, reason: str, drops: list[Drop]) -> Recording:
     wrong = wrong & measured(recording.upper_body().joints)
     for joint in torch.nonzero(wrong.any(0)).flatten().tolist():
-        drops.append(_some(reason, recording, UPPER_BODY[joint], wrong[:, joint]))
+        drops.append(_drop_some(reason, recording, UPPER_BODY[joint], wrong[:, joint]))
     return with_missing(recording, wrong)
 
 
@@ -254,14 +254,14 @@ def _shoulder_widths(recordings: Sequence[Recording]) -> dict[str, float]:
     return {person: float(torch.cat(w).nanmedian()) for person, w in widths.items()}
 
 
-def _whole(reason: str, recording: Recording, why: str) -> Drop:
+def _drop_whole(reason: str, recording: Recording, why: str) -> Drop:
     return drop_frames(
         reason, label(recording), recording.person_id, "", range(len(recording)),
         recording.first_frame, why,
     )  # fmt: skip
 
 
-def _some(reason: str, recording: Recording, joint: str, frames: Tensor) -> Drop:
+def _drop_some(reason: str, recording: Recording, joint: str, frames: Tensor) -> Drop:
     listed = torch.nonzero(frames).flatten().tolist()
     return drop_frames(
         reason, label(recording), recording.person_id, joint, listed, recording.first_frame

@@ -277,7 +277,7 @@ def _performed(
     for action in actions:
         mine = [i for i, r in enumerate(recordings) if r.action == action]
         learnt = [angles[i] for i in mine if i < n_train]
-        parts_of_mine = _parts([angles[i] for i in mine], learnt, fps, repeated)
+        parts_of_mine = _single_performances([angles[i] for i in mine], learnt, fps, repeated)
         for i, parts in zip(mine, parts_of_mine, strict=True):
             person = recordings[i].person_id
             found += [Performed(person, action, angles[i][part]) for part in parts]
@@ -287,7 +287,7 @@ def _performed(
     return kept, len(found) - len(kept)
 
 
-def _parts(
+def _single_performances(
     angles: Sequence[Tensor], learnt: Sequence[Tensor], fps: float, repeated: bool
 ) -> list[list[slice]]:
     """Return the frames of the single performances in each recording of an action."""

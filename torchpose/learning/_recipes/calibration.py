@@ -149,7 +149,7 @@ def _track_at(
     seed: int,
     fps: float,
 ) -> dict[str, HeldOut]:
-    keypoints, truth, inside = _seen(prior, [piece.joints for piece in pieces], seed)
+    keypoints, truth, inside = _noisy_keypoints(prior, [piece.joints for piece in pieces], seed)
     scored = inside & torch.isfinite(truth).flatten(2).all(2)
     who = [pieces[i].person for i in scored.nonzero()[:, 0].tolist()]
     found = {}
@@ -166,7 +166,7 @@ def _track_at(
     return found
 
 
-def _seen(
+def _noisy_keypoints(
     prior: UpperBodyPrior, sequences: list[Tensor], seed: int
 ) -> tuple[Float[Tensor, "B T 8 2"], Float[Tensor, "B T 8 3"], Bool[Tensor, "B T"]]:
     """Return noisy keypoints of head, neck and hands, each sequence from a viewpoint of its own."""

@@ -157,7 +157,7 @@ class ActionBank(nn.Module):
         gated = self._gated
         z, std = self.project(postures)[..., :gated], self.match_std[:, None, :gated]
         log = -0.5 * self._squared(z, std)
-        log = log.masked_fill(~self._there(), -math.inf)
+        log = log.masked_fill(~self._is_posture(), -math.inf)
         index = own[..., None, None].expand(*own.shape, 1, log.shape[-1])
         log = log.gather(-2, index).squeeze(-2)
         if uniform is None:
@@ -184,7 +184,7 @@ class ActionBank(nn.Module):
             ShapeError: other than 36 angles. InputError: a width that is not positive.
         """
         check_gate_width(width)
-        z, own = self._own(postures, actions)
+        z, own = self._project_on_own(postures, actions)
         within = (z - self.performance[own, j]).abs() < width * self.std[own, j]
         return within[..., : self._gated].all(-1) | (actions == self.none)
 
@@ -218,7 +218,7 @@ class ActionBank(nn.Module):
         gated = torch.arange(std.shape[-1], device=std.device) < self._gated
 
         def clamp(angles: Tensor, width: float) -> Tensor:
-            z, _ = self._own(angles, actions)
+            z, _ = self._project_on_own(angles, actions)
             step = gated * (clamp_offset(z - centre, std, width) - (z - centre))
             return angles + (basis @ step[..., None]).squeeze(-1)
 
@@ -243,7 +243,9 @@ class ActionBank(nn.Module):
         std = self.info.spread * self.std
         used = torch.arange(std.shape[-1], device=z.device) < self.n_dimensions[:, None]  # [A, D]
         tube = -0.5 * self._squared(z, std) - (std.log() * used[:, None]).sum(-1)  # [..., A, K]
-        tube = tube.masked_fill(~self._there(), -math.inf).logsumexp(-1) - self.n_postures.log()
+        tube = (
+            tube.masked_fill(~self._is_posture(), -math.inf).logsumexp(-1) - self.n_postures.log()
+        )
         total = (postures.unsqueeze(-2) - self.mean).square().sum(-1)
         left = (total - z.square().sum(-1)).clamp_min(0) / self.residual_std.square()
         outside = -0.5 * left - (POSTURE_DIM - self.n_dimensions) * self.residual_std.log()
@@ -400,7 +402,7 @@ class ActionBank(nn.Module):
 
     # --- pieces -----------------------------------------------------------------------------------
 
-    def _own(self, postures: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+    def _project_on_own(self, postures: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the projection [..., D] of each on its own action, and that action (none: the last one)."""
         own = actions.clamp_max(self.none - 1)
         z = self.project(postures)
@@ -425,7 +427,7 @@ class ActionBank(nn.Module):
         """Return the number of dimensions that the gates use."""
         return min(self.info.gate_dimensions or self.basis.shape[-1], self.basis.shape[-1])
 
-    def _there(self) -> Tensor:
+    def _is_posture(self) -> Tensor:
         """Return [A, K], True for postures that are not padding."""
         k = torch.arange(self.performance.shape[1], device=self.performance.device)
         return k < self.n_postures[:, None]

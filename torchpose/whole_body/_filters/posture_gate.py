@@ -136,8 +136,8 @@ def redraw_until_accepted(
         index, before = rows.at, count[rows.at]
         waiting = before == 0
         states[index[waiting]] = block.states[waiting]
-        draws[index] += torch.where(waiting, _place(block.total, 1), 0)
-        until[index] += _place(before[:, None] + block.total, wanted)
+        draws[index] += torch.where(waiting, _draws_until(block.total, 1), 0)
+        until[index] += _draws_until(before[:, None] + block.total, wanted)
         count[index] = before + block.total[:, -1]
         done += times
     share = torch.full(first.shape, torch.nan, dtype=torch.float64, device=first.device)
@@ -165,11 +165,11 @@ def _block(
     several = rows.repeated(times)
     drawn = draw(several)
     total = accept(drawn, several).view(-1, times).long().cumsum(1)
-    chosen = torch.arange(len(total), device=total.device) * times + _place(total, 1) - 1
+    chosen = torch.arange(len(total), device=total.device) * times + _draws_until(total, 1) - 1
     return _Block(drawn[chosen], total)
 
 
-def _place(total: Tensor, wanted: int) -> Tensor:
+def _draws_until(total: Tensor, wanted: int) -> Tensor:
     """Return the number of draws [r] until `wanted` were accepted, or all draws."""
     return (total < wanted).sum(1).add_(1).clamp_max_(total.shape[1])
 

@@ -255,9 +255,9 @@ class BodyKalmanFilter(nn.Module):
         state = state._replace(mean=a.moved(state.mean, step), cov=state.cov - U.mT @ U)
         if self.upright is None:
             return state
-        return self._told(state, self.upright.lean(a, state.mean), share)
+        return self._with_expected(state, self.upright.lean(a, state.mean), share)
 
-    def _told(
+    def _with_expected(
         self, state: BodyGaussian, expected: Expected, share: float | Float[Tensor, "B K"]
     ) -> BodyGaussian:
         """Return the Gaussian after a share of the information about what is expected of a body."""
@@ -289,7 +289,7 @@ class BodyKalmanFilter(nn.Module):
         carried = torch.zeros_like(state.cov[..., 0])
         carried[rows, self.articulation.columns["position"]] = _CARRIED**2 / self.fps
         state = state._replace(cov=state.cov + torch.diag_embed(carried))
-        state = replaced(state, rows, self._held(taken(state, rows)))
+        state = replaced(state, rows, self._with_leans(taken(state, rows)))
         corrected = self._corrected_as_predicted(state, frame, readings)
         return corrected._replace(widened=corrected.widened + carried)
 
@@ -304,11 +304,11 @@ class BodyKalmanFilter(nn.Module):
         rows = seen.any(-1) & ~seen.index_select(-1, hips).any(-1) & (len(self.maps.shift) > 1)
         return rows.nonzero().squeeze(-1)
 
-    def _held(self, state: BodyGaussian) -> BodyGaussian:
+    def _with_leans(self, state: BodyGaussian) -> BodyGaussian:
         """Return Gaussians after more information about leans, without which hips that are not seen drift."""
         body, share = self.articulation, self.transition.share
-        state = self._told(state, self._up.lean(body, state.mean), _HELD_PELVIS * share)
-        return self._told(state, self._up.trunk_lean(body, state.mean), _HELD * share)
+        state = self._with_expected(state, self._up.lean(body, state.mean), _HELD_PELVIS * share)
+        return self._with_expected(state, self._up.trunk_lean(body, state.mean), _HELD * share)
 
     def with_usual_legs(self, state: BodyGaussian, share: Float[Tensor, "B 12"]) -> BodyGaussian:
         """Return Gaussians after shares of the information about where legs are below the hips on average.
@@ -316,7 +316,7 @@ class BodyKalmanFilter(nn.Module):
         Args:
             state: of [B]. share: of every joint along every axis, as of `Upright.legs`; not zero.
         """
-        return self._told(state, self._up.legs(self.articulation, state.mean), share)
+        return self._with_expected(state, self._up.legs(self.articulation, state.mean), share)
 
     def _corrected_as_predicted(
         self, state: BodyGaussian, frame: KeypointFrame, readings: KeypointFrame

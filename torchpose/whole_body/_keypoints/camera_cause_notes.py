@@ -83,7 +83,7 @@ def find_cause(rig: CameraRig, frames: KeypointFrame) -> CameraCause | None:
     Args:
         rig: two cameras or more. frames: keypoints [T, C, J].
     """
-    some = _some(without_still_frames(frames))
+    some = _some_frames(without_still_frames(frames))
     count = float((some.inlier * ((some.inlier > 0).sum(1, keepdim=True) >= 2)).sum())
     if count < _LEAST_KEYPOINTS:
         return None
@@ -174,7 +174,7 @@ def _alike(one: _Tried, other: _Tried) -> bool:
     return same and one.camera == other.camera
 
 
-def _some(frames: KeypointFrame) -> KeypointFrame:
+def _some_frames(frames: KeypointFrame) -> KeypointFrame:
     """Return frames, few enough, in which two cameras see the person."""
     return frames.some((frames.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
 

@@ -119,14 +119,14 @@ def explain(rig: CameraRig, frames: KeypointFrame, causes: Causes) -> Explained:
     errors = torch.zeros_like(prior)
     joints = _first_joints(rig, frames, causes)
     for width in _WIDTHS:
-        views = _seen(rig, joints, causes, errors)
+        views = _views(rig, joints, causes, errors)
         chol, E, b, S, g = _equations(rig, frames, views, causes, errors, width)
         step = _solved(S, g - prior * errors, prior)
         joints = joints + torch.cholesky_solve(b - E @ step[:, None, None], chol).squeeze(-1)
         errors = torch.where(causes.free, errors + step.squeeze(-1), 0.0)
     free = _solved(S, g, known.expand_as(prior)).squeeze(-1)
     promise = 0.5 * (free * g).sum(-1)
-    views = _seen(rig, joints, causes, errors)
+    views = _views(rig, joints, causes, errors)
     off, variance = _residuals(frames, views)
     square = off.square().sum(-1)
     ratio = torch.where(views.in_front, square / variance, _BEHIND) / _FREEDOM
@@ -153,7 +153,7 @@ def _first_joints(
     return joints.unflatten(0, (count, n_frames))
 
 
-def _seen(
+def _views(
     rig: CameraRig, joints: Float[Tensor, "N T J 3"], causes: Causes, errors: Float[Tensor, "N 8"]
 ) -> _Views:
     """Return joints as cameras see them, one of which has errors."""

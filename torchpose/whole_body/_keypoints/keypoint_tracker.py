@@ -459,7 +459,11 @@ class KeypointTracker(nn.Module):
         poses = filtered if self.only is None else self.only.as_last_told(filtered)
         states = BodyMoments(poses.point, poses.state_cov)
         for rows, part in smooth(self.filter, states, widened, poses.started, poses.coasting):
-            write_part(_told(poses), rows, _told(self._as_smoothed(part_of(poses, rows), part)))
+            write_part(
+                _smoothed_fields(poses),
+                rows,
+                _smoothed_fields(self._as_smoothed(part_of(poses, rows), part)),
+            )
         return poses
 
     def _as_smoothed(self, poses: KeypointPoses, smoothed: BodyMoments) -> KeypointPoses:
@@ -484,6 +488,6 @@ def to_be_smoothed(
     return pose._replace(point=found.state.mean, state_cov=found.state.cov), found.widened
 
 
-def _told(poses: KeypointPoses) -> tuple[Any, ...]:
+def _smoothed_fields(poses: KeypointPoses) -> tuple[Any, ...]:
     """Return what smoothing changes."""
     return poses.joints, poses.covariance, poses.point, poses.state_cov, poses.joint_cov
