@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 _HEADER = struct.Struct("<QQq")  # bytes of the pickle, of the arrays, and where these are in memory
-_IN_PIPE = -1  # in place of where they are
+_IN_PIPE = -1  # the place of arrays that are in no shared memory
 _STEP = 64  # arrays begin at multiples of this many bytes
-_SHARES = 16  # what is larger than this part of the memory goes through the pipe
+_SHARES = 16  # what is larger than one of so many parts of the memory goes through the pipe
 WAITING = _SHARES - 2  # values that may be sent before they are received
 
 

@@ -239,7 +239,7 @@ class BodySkeleton:
         raise InputError("the body height needs at least one bone length, got none that is finite")
 
 
-_LEG_BONE = 0.2  # of the body height: only the bones of the legs are as long
+_LEG_BONE = 0.2  # share of the body height above which a bone is one of the legs
 
 
 def _check_lengths(skeleton: BodySkeleton) -> None:

@@ -9,7 +9,7 @@ from torchpose.errors import CameraError, FileFormatError
 
 _KEYS = ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye", "up")
 _OF_CAMERAS = ("size", "distortions", "rotation", "translation")  # what no other table has
-_ALIKE = 0.8  # of two keys, of which one is the other misspelt
+_ALIKE = 0.8  # similarity of two keys from which on one is the other misspelt
 _ALL = "cameras"  # the table in which some programs put those of cameras, by their numbers
 _QUIET = ("metadata",)  # tables that are passed over without a word
 

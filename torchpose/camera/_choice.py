@@ -20,7 +20,7 @@ from torchpose.errors import CameraError, InputError
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _LEAST_FOCAL = 10.0  # pixels
 _FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
-_SQUEEZED = 0.02  # of the ratio of the sides: images of another shape are cut, and not scaled
+_SQUEEZED = 0.02  # difference of the ratio of the sides beyond which images are cut, and not scaled
 
 
 def resolve_camera(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchpose.video._source_interface import VideoSource
     from torchpose.whole_body._body_track import BodyTrack
 
-_FOLDED = 0.01  # of a ray's length: between it and what its pixel is undistorted to
+_FOLDED = 0.01  # distance of a ray from what its pixel is undistorted to, at most, over its length
 _SAME_RATE = 0.01  # relative: of videos that are not resampled
 
 

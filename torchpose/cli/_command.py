@@ -27,7 +27,7 @@ _METAVARS = {
     "videos": "VIDEO",
     "what": "PRIOR|FILE", "window_components": "K", "without": "PERSON", "without_files": "NAME",
 }  # fmt: skip
-_HOW = ("out", "config", "pictures")  # no part of what is made
+_NO_PART = ("out", "config", "pictures")  # options that are no part of what is made
 _SHOWN_PATHS = 8
 _SEED_DIGITS = 18  # so that it stays one of 64 bits when a little is added
 
@@ -76,7 +76,7 @@ class Given(NamedTuple):
             paths = [*paths[:1], f"...{len(paths) - 1} more"]
         parts = ["torchpose", *self.words, *paths, "--out", str(out)]
         for key, value in self.values.items():
-            if key in ("recordings", *_HOW) or value == self.defaults.get(key):
+            if key in ("recordings", *_NO_PART) or value == self.defaults.get(key):
                 continue
             values = value if isinstance(value, list) else [value]
             shown = [str(one).lower() if isinstance(one, bool) else str(one) for one in values]

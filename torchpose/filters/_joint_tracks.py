@@ -36,7 +36,7 @@ from torchpose.filters._weights import estimate_of
 from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
 _TRACK_NUMBERS = 1 << 17  # in the tracks that are stepped at a time: 1 MB, which stay in the cache
-_SHARED_NUMBERS = 1 << 18  # where one product serves all, or where small operations wait
+_SHARED_NUMBERS = 1 << 18  # the same where one product serves all, or small operations wait
 _LOGS = 16  # standard deviations whose product is within range, and costs one logarithm
 
 

@@ -60,9 +60,9 @@ BACK_TO_CAMERA = (
     "right exchanged"
 )
 """The note on a recording of joints that are perhaps mirrored."""
-_BESIDE_BODY = 0.3  # of its size: how far outside its other joints a centred body's origin may be
+_BESIDE_BODY = 0.3  # most distance of a centred body's origin from its joints, over their extent
 _SHOWN_JOINTS, _LISTED = 3, 2  # joints, and files, that a note names
-_BACK = 2 * math.pi / 3  # of the mean heading, from where on the back is to the camera
+_BACK = 2 * math.pi / 3  # radians of the mean heading, from which on the back is to the camera
 _FAR = 1e9  # in the unit of the file; no joint is there
 
 

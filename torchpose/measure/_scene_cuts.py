@@ -12,8 +12,8 @@ _AROUND = 7  # pixels of a pattern over which its mean is taken away
 _DARKEST = 16.0  # grey levels that are added, so that noise of dark pixels counts little
 _SHIFT = (3, 4)  # rows and columns by which a pattern may have moved from frame to frame
 _BLANK = 0.03  # deviation of a pattern below which the image shows nothing
-_LEAST, _CLEAR = 0.4, 0.65  # change of a cut after rest, and after motion
-_TIMES, _ALWAYS = 4.0, 1.5  # of the usual change
+_LEAST, _CLEAR = 0.4, 0.65  # change from which on a frame is a cut, after rest and after motion
+_TIMES, _ALWAYS = 4.0, 1.5  # factors of the usual change that it exceeds: up to `_CLEAR`, always
 _MEMORY = 0.5  # seconds in which the usual change halves
 _LOGARITHM = np.log(np.arange(256) + _DARKEST).astype(np.float32)
 

@@ -43,7 +43,7 @@ PART_TREE: tuple[tuple[str, str], ...] = (
 """Parts above and below of every edge (DX, Figure 2); the root sends no messages, it conditions all."""
 
 _DIRECTIONS = "sigma_point_directions"  # in `LimbInfo.extra` of a file, where they are not "eigen"
-_SAME_CENTRE = 1e-6  # of a quaternion vector
+_SAME_CENTRE = 1e-6  # difference of quaternion vectors that count as the same
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from torchpose.upper_body._limb_nodes import (
 )
 from torchpose.upper_body._torso_occlusion import log_in_view
 
-_ANGLES = 17  # of a bone whose end is measured
-_AROUND = 150  # directions of one whose end is not
-_BOTH = 68  # of each of two such bones
-_STEP = math.radians(10.0)  # of a direction from frame to frame at 30 frames a second
+_ANGLES = 17  # directions of a bone whose end is measured
+_AROUND = 150  # directions of a bone whose end is not measured
+_BOTH = 68  # directions of each of two bones whose ends are not measured
+_STEP = math.radians(10.0)  # step of a direction in a frame, at 30 frames a second
 _ANEW = 0.2  # share of an arm's belief that is reinitialised in a frame at 30 frames a second
 _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose hand is not measured
 # Exponent of what later frames say of an arm whose hand is measured: they err as the frame itself does.

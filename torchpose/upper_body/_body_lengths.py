@@ -29,16 +29,16 @@ shoulders, and from Kinect's neck, 10.5 cm above the middle of the shoulders, up
 is measured."""
 
 _NUDGE = 0.03  # step of the finite differences in log-length
-_MOST = 0.1  # of a log-length that one frame may change it by
-_POWER = 0.1  # of a frame's likelihood of the lengths: frames of one pose are alike
+_MOST_CHANGE = 0.1  # largest change of a log-length by one frame
+_POWER = 0.1  # exponent of a frame's likelihood of the lengths: frames of one pose are alike
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
-_GIVEN = 0.02  # of the log of a length that was measured on the person
+_GIVEN_STD = 0.02  # standard deviation of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres
-_HEIGHT = 1.70  # metres: of whom the prior's lengths are taken for
-_OF_HEIGHT = 0.055  # of the log of a length: what the heights of grown-ups explain
-_SUREST = 0.01  # of the log of a length relative to others
-_TOGETHER = 0.72  # of the variance of a torso's lengths relative to arms: one size explains it
-_LEAST = 0.04  # of the log of a length that is only known in proportion
+_HEIGHT = 1.70  # metres, height of the person whose lengths the prior's are taken to be
+_STD_OF_HEIGHT = 0.055  # standard deviation of the log of a length by the heights of grown-ups
+_LEAST_OWN_STD = 0.01  # least standard deviation of the log of a length relative to others
+_SHARE_OF_SIZE = 0.72  # of the variance of a torso's lengths relative to arms: one size explains it
+_LEAST_STD = 0.04  # least standard deviation of the log of a length known in proportion only
 
 
 class KnownBody(NamedTuple):
@@ -135,7 +135,7 @@ class BodyLengths:
     def _grow(self, height: float) -> None:
         """Expect the lengths of a person of this height."""
         self.unit = check_height(height) / _HEIGHT
-        left = (self.spread.square() - _OF_HEIGHT**2).clamp_min(_LEAST**2)
+        left = (self.spread.square() - _STD_OF_HEIGHT**2).clamp_min(_LEAST_STD**2)
         self.spread = left.sqrt().minimum(self.spread)
 
     def _recognise(self, person: PoseTrack | str | Path) -> None:
@@ -178,7 +178,7 @@ class BodyLengths:
         rows = [BODY_LENGTHS.index(name) for name in given]
         values = self.usual.new_tensor([number_of(metres) for metres in given.values()])
         lengths = values + self.lower[rows]
-        self._expect(rows, lengths, _GIVEN * (values / lengths))
+        self._expect(rows, lengths, _GIVEN_STD * (values / lengths))
 
     def _expect(self, rows: list[int], metres: Tensor, spread: Tensor) -> None:
         """Expect these lengths, and the others in proportion."""
@@ -198,7 +198,7 @@ class BodyLengths:
     def size_spread(self) -> Tensor:
         """Return the standard deviation of the log of a torso's size relative to arms (`RootGrid`)."""
         own = self.spread.square() - self.scale.square()
-        return (_TOGETHER * own[2:].amin()).clamp_min(0.0).sqrt()
+        return (_SHARE_OF_SIZE * own[2:].amin()).clamp_min(0.0).sqrt()
 
     def init(self, batch_size: int, of_size: Float[Tensor, " B"]) -> Lengths:
         """Return the prior over the lengths before the first frame, given the size of the torso.
@@ -208,7 +208,7 @@ class BodyLengths:
         """
         own = (self.spread.square() - self.scale.square()).repeat(batch_size, 1)
         own[:, 2:] -= of_size[:, None]
-        own = own.clamp_min(_SUREST**2)
+        own = own.clamp_min(_LEAST_OWN_STD**2)
         own[:, self.surest] = self.scale.square()
         precision = own.reciprocal()
         return Lengths(torch.zeros_like(precision), precision)
@@ -261,7 +261,7 @@ class BodyLengths:
         slope = _POWER * torch.cat([slope, width[0], height[0]], 1)
         bend = _POWER * torch.cat([bend, width[1], height[1]], 1).clamp_min(0.0)
         precision = lengths.precision + bend
-        mean = lengths.mean + (slope / precision).clamp(-_MOST, _MOST)
+        mean = lengths.mean + (slope / precision).clamp(-_MOST_CHANGE, _MOST_CHANGE)
         mean = mean - mean[:, [self.surest]]
         limit = 3.0 * self.spread
         return Lengths(mean.clamp(-limit, limit), precision)

@@ -13,14 +13,14 @@ from torchpose.skeleton._joint_sets import canonical_names
 
 _UPPER = ("head", "nose", "neck")
 _LOWER = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right", "hip_left", "hip_right")
-_SURE = 0.3  # confidence
+_LEAST_CONFIDENCE = 0.3  # confidence below which a keypoint is left out
 _MOST = 0.8  # share of the frames in which a doubt has to hold
-_ALONG = 0.7  # of the way from the trunk to the head: the cosine of 45 degrees
+_ALONG = 0.7  # cosine of the largest angle between the way from trunk to head and a direction
 _LOW_NECK = 0.1  # of the way from the middle of the shoulders to the head; Kinect's neck is at 0.37
 
-_SHORTER = 0.55  # of the other forearm; the least of 348 clips of twenty persons is 0.69
-_LONGEST = 0.95  # quantile over the frames
-_ENOUGH = 30  # frames
+_SHORTER = 0.55  # over the other forearm's length; the least of 348 clips of twenty persons is 0.69
+_LONGEST = 0.95  # quantile of the lengths in all frames that counts as the longest
+_LEAST_FRAMES = 30  # frames with a length, below which none counts
 
 
 def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> None:
@@ -101,7 +101,7 @@ class _Joints:
         self._places = {name: i for i, name in enumerate(canonical_names(keypoints.names))}
         doubtful = torch.zeros(1, dtype=torch.bool)
         if keypoints.confidence is not None:
-            doubtful = keypoints.confidence[..., None] < _SURE
+            doubtful = keypoints.confidence[..., None] < _LEAST_CONFIDENCE
         self._pixels = keypoints.keypoints.masked_fill(doubtful, torch.nan)
 
     def __call__(self, name: str) -> Float[Tensor, "T 2"]:
@@ -156,7 +156,7 @@ def _longest_forearm(joints: _Joints, side: str) -> float:
         end = joints(f"hand_{side}")
     lengths = torch.linalg.vector_norm(end - joints(f"elbow_{side}"), dim=-1)
     known = lengths[lengths.isfinite()]
-    return float(known.quantile(_LONGEST)) if len(known) >= _ENOUGH else math.nan
+    return float(known.quantile(_LONGEST)) if len(known) >= _LEAST_FRAMES else math.nan
 
 
 def _mostly(values: Float[Tensor, " T"], bound: float) -> bool:

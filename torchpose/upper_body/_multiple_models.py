@@ -38,7 +38,8 @@ from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
 _MEMORY = 4.0  # seconds after which evidence counts for 1/e
-_SHARE = 0.5  # of the mean evidence of a frame that counts: frames are alike, so many are as few
+# Share of the mean evidence that counts: frames are alike, so many tell no more than few.
+_EVIDENCE_SHARE = 0.5
 _FIRST = 0.5  # log-odds of windows before the first frame
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
 # between the two. As four sets have it that were in no fit.
@@ -218,7 +219,7 @@ class MultipleModelFilter(Estimator):
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             poses = poses._replace(covs=recalibrated(poses.covs, noise, mode))
         mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
-        share = torch.sigmoid(_FIRST + _SHARE * mean_ratio)
+        share = torch.sigmoid(_FIRST + _EVIDENCE_SHARE * mean_ratio)
         mixed = _averaged(share, poses, bodies.poses)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)

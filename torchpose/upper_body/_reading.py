@@ -207,7 +207,8 @@ def check_frame(frame: str, static_camera: bool) -> None:
 
 
 _FEW = 2.0  # particles: below that, one of them has most of the weight
-_SHARE = 0.25  # of the frames of an arm; quick movements alone lose the others in fewer
+# Share of the frames of an arm with so few, above which it is said: quick movements alone have fewer.
+_COLLAPSED_SHARE = 0.25
 
 
 def note_collapse(track: PoseTrack) -> PoseTrack:
@@ -227,7 +228,7 @@ def note_collapse(track: PoseTrack) -> PoseTrack:
     frames = torch.arange(size.shape[1], device=size.device)
     counted = size.isfinite() & (frames < track.lengths.to(size.device)[:, None])[..., None]
     few = (counted & (size < _FEW)).sum(1)
-    collapsed = few > _SHARE * counted.sum(1)
+    collapsed = few > _COLLAPSED_SHARE * counted.sum(1)
     if not bool(collapsed.any()):
         return track
     arms = " and ".join(

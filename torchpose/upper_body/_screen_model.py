@@ -62,9 +62,9 @@ APART = 0.25
 _NECK = UPPER_BODY.index("neck")
 _ENLARGED = 3.0  # sides of the place where outliers lie, over those of the image
 _PERSISTENCE = 0.2  # seconds over which a velocity is forgotten
-_SCALES = (0.3, 0.45, 0.67, 1.0, 1.5, 2.25, 3.4)  # of the person, over that of the prior's mean
-_SCALE_SPREAD, _SCALE_MEMORY = 0.5, 1.0  # of its log; seconds
-_EXCHANGED, _STILL_EXCHANGED = 0.01, 0.7  # probability that hands are, and that they stay so
+_SCALES = (0.3, 0.45, 0.67, 1.0, 1.5, 2.25, 3.4)  # sizes of the person relative to the prior's mean
+_SCALE_SPREAD, _SCALE_MEMORY = 0.5, 1.0  # deviation of its log; seconds over which it is forgotten
+_EXCHANGED, _STILL_EXCHANGED = 0.01, 0.7  # probabilities that hands become so, and stay so
 
 
 class ScreenModel(NamedTuple):

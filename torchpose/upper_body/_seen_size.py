@@ -15,8 +15,8 @@ _MEMORY = 0.3  # seconds
 # Of height and width: how much noise, raised shoulders and small turns change their logs, and the weight
 # of what is beyond that, since shoulders are seen closer together when they turn too.
 _UNSURE, _WEIGHTS = (0.1, 0.2), (1.0, 0.4)
-_FASTEST = 0.5  # of the log of a size in a second: nobody walks faster, but turns are
-_LEAST = 1e-3  # of a ray: shoulders may be seen one behind the other
+_MOST_CHANGE = 0.5  # of the log of a size in a second: nobody walks faster, but turns are
+_LEAST_LENGTH = 1e-3  # least length between rays: shoulders may be seen one behind the other
 
 
 class SeenSize(NamedTuple):
@@ -54,12 +54,14 @@ def follow_size(
     lengths = torch.stack([(left + right)[:, 1] / 2.0 - head[:, 1], (left - right)[:, 0].abs()], 1)
     both = torso.known[:, :2].all(1)
     known = torch.stack([both & torso.known[:, 3], both], 1)
-    logs = lengths.clamp_min(_LEAST).log()
+    logs = lengths.clamp_min(_LEAST_LENGTH).log()
     first = size.mean.isnan()
     mean = size.mean + (1 - math.exp(-seconds / _MEMORY)) * (logs - size.mean)
     mean = torch.where(known, torch.where(first, logs, mean), size.mean)
     unsure = mean.new_tensor(_UNSURE)
     held = torch.where(first, mean, size.held.clamp(mean - unsure, mean + unsure))
-    change = (held - size.held).nan_to_num(0.0).clamp(-_FASTEST * seconds, _FASTEST * seconds)
+    change = (
+        (held - size.held).nan_to_num(0.0).clamp(-_MOST_CHANGE * seconds, _MOST_CHANGE * seconds)
+    )
     of_height, of_width = (change * change.new_tensor(_WEIGHTS)).unbind(1)
     return SeenSize(mean, held), -torch.where(known[:, 0], of_height, of_width)

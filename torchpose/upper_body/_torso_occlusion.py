@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 _WIDE, _DEEP = 0.45, 0.25  # half the width and depth of a torso, in widths of the shoulders
-_TOP, _BOTTOM = 0.15, 1.5  # where it begins and ends, below the shoulders, in the same
-_SOFT, _SOFT_TOP, _SOFT_BOTTOM = 0.15, 0.05, 0.1  # of its surface, in half depths; of its ends
+_TOP, _BOTTOM = 0.15, 1.5  # its ends below the shoulders, in widths of the shoulders
+_SOFT, _SOFT_TOP, _SOFT_BOTTOM = 0.15, 0.05, 0.1  # softness of its surface (half depths), its ends
 _FACING = 0.2  # sine of the turn about which a front becomes a back
 _NARROWEST = 1e-3  # metres: measured shoulders may lie on one ray
 _HIDDEN = 0.1  # how often joints in a torso, or behind it, are measured, relative to those in view

@@ -24,7 +24,7 @@ _LEAST = 4 * _LAYERS  # likelihoods of a frame: two of a layer's particles survi
 _RATE = 60.0  # frames per second for which `default_step_std` is
 _SHARPNESS = 100.0  # exponent of the mean likelihood of a frame, as of the filters
 _SURE = 3.0  # log-odds of a walk, and of bent knees, that leave no doubt
-_BEND, _STEP = 0.1, 0.1  # metres of either that say about as much
+_BEND, _STEP = 0.1, 0.1  # metres of a walk, and of bent knees, that say about as much
 
 
 class FirstPose(NamedTuple):

@@ -16,9 +16,9 @@ import numpy as np
 from torchpose._core.assignment import best_columns
 
 _NEAR = 0.08  # sizes of a person, standard deviation of the way from one frame to the next
-_GROWTH = 0.02  # by which it grows with every frame without the person
-_FARTHEST = 5.0
-_ANYWHERE = 10.0  # of somebody new
+_GROWTH = 0.02  # growth of that deviation with every frame without the person
+_FARTHEST = 5.0  # sizes, the largest such deviation
+_ANYWHERE = 10.0  # sizes, standard deviation of where somebody new is
 _SAME = 0.1  # sizes, within which two detections are of one person
 _FORGOTTEN = 100  # frames without a person other than the followed one
 _LEAST_SIZE = 1.0  # pixels

@@ -38,7 +38,7 @@ _VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a p
 _FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
 # Frames at the prior's rate; pieces at other rates last as long.
 _PIECE = 300  # at most, so that one long recording does not pad all others
-_SHORT = 60  # for the filters that draw
+_SHORT = 60  # frames of a piece for the filters that draw
 _NOISE = 3.0  # pixels
 
 

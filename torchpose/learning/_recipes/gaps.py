@@ -16,7 +16,7 @@ from torchpose.math._hermite import hermite
 LONGEST_GAP = 0.2
 """Seconds from one whole frame to the next, up to which joints that are missing between are interpolated."""
 _SHORTEST_PIECE = 0.5  # seconds of a recording between long gaps; shorter ones tell no motion
-_ROUNDING = 1e-6  # of that time
+_ROUNDING = 1e-6  # relative error of the longest gap by rounding
 
 
 def missing_joints(joints: Float[Tensor, "T J 3"]) -> Bool[Tensor, "T J"]:

@@ -21,8 +21,8 @@ from torchpose.errors import PriorError
 from torchpose.priors._facts import ManifoldFacts
 
 _GROWTH = "noise_growth"  # in `extra`: exponents of standard deviations over time
-_SAME_FRAME_RATE = 0.01  # of it
-_SAME_CENTRE = 1e-6  # of a quaternion vector
+_SAME_FRAME_RATE = 0.01  # relative difference of frame rates that count as the same
+_SAME_CENTRE = 1e-6  # difference of quaternion vectors that count as the same
 
 
 @dataclass(frozen=True)

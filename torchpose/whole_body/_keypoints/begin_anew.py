@@ -10,7 +10,7 @@ LEAST_JOINTS = 6  # that are measured where tracking begins
 _PATIENCE = 0.5  # seconds that a start waits for a second camera, which tells the distance
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
-_AWAY = 0.5  # of a lost frame counts one in which nobody is seen: a second until a new start
+_AWAY = 0.5  # share of a lost frame that one without anybody counts: a second until a new start
 
 
 def sees_enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:

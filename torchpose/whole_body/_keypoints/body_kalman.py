@@ -72,8 +72,8 @@ FEW_INLIERS = 0.7
 _JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
 _AGAIN = 0.1  # metres, from where cameras agreed on such a joint to where they do one frame later
 _CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which no camera sees a hip
-_HELD = 20.0  # shares of the information about the lean of a trunk that such a body gets
-_HELD_PELVIS = 2.0  # and about that of its pelvis
+_HELD_TRUNK = 20.0  # shares of the information about the lean of its trunk that such a body gets
+_HELD_PELVIS = 2.0  # shares of that about the lean of its pelvis
 _NO_DOUBT = -12.0
 _ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
@@ -308,7 +308,9 @@ class BodyKalmanFilter(nn.Module):
         """Return Gaussians after more information about leans, without which hips that are not seen drift."""
         body, share = self.articulation, self.transition.share
         state = self._with_expected(state, self._up.lean(body, state.mean), _HELD_PELVIS * share)
-        return self._with_expected(state, self._up.trunk_lean(body, state.mean), _HELD * share)
+        return self._with_expected(
+            state, self._up.trunk_lean(body, state.mean), _HELD_TRUNK * share
+        )
 
     def with_usual_legs(self, state: BodyGaussian, share: Float[Tensor, "B 12"]) -> BodyGaussian:
         """Return Gaussians after shares of the information about where legs are below the hips on average.

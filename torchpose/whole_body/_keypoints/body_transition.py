@@ -12,9 +12,9 @@ from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._motion_drift import drift_at
 
 _SCALE_DRIFT = 0.002  # of the log of a bone's length, per root of a second
-_EXCHANGES = 0.1  # per second and camera, sides begin to be exchanged
-_RETURNS = 3.0  # and end to be, while they are
-_LOST = 0.2  # per second, a joint is elsewhere than predicted
+_EXCHANGES = 0.1  # rate, per second and camera, at which sides begin to be exchanged
+_RETURNS = 3.0  # rate, per second, at which exchanged sides become right again
+_LOST = 0.2  # rate, per second, at which a joint comes to be elsewhere than predicted
 _STAYS_LOST = 0.6  # share of such joints that a frame does not find again
 _ODDS = 1e-6  # least probability
 _JUMPS = {"position": 0.1, "rotations": 0.7, "velocity": 5.0, "shifts": 0.05}

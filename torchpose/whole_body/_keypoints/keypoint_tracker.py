@@ -75,7 +75,7 @@ from torchpose.whole_body._keypoints.only_camera import OnlyCamera
 from torchpose.whole_body._keypoints.pose_maker import PoseMaker
 from torchpose.whole_body._keypoints.watched_cameras import by_right_cameras
 
-_LEAST_SHARE = 1e-9  # of information, of nothing
+_LEAST_SHARE = 1e-9  # least share of information: with none the variance would be infinite
 # What is found in a frame; the last are those who begin with it.
 _Found = tuple[KeypointStream, CorrectedBody, Bool[Tensor, " B"]]
 

@@ -16,8 +16,8 @@ from torchpose.whole_body._keypoints.keypoint_start import FEW_HEADINGS, start
 # Values of `frames_lost`: in the second frame of exchanged sides, and every third after it.
 _FIRST, _EVERY = 1.0, 1.5
 _LEAST_GAIN = 5.0  # log-evidence of the sides as they are, in every frame
-_MOST_GAIN = 15.0  # that one frame counts; sides are wrong with more
-_MOST_CAMERAS = 3  # that see a limb; of more the others tell
+_MOST_GAIN = 15.0  # log-evidence of one frame, at most; sides are wrong with more
+_MOST_CAMERAS = 3  # cameras that see a limb, at most; where more do the others tell
 _SEEN = 0.5  # share of the joints of a limb that such a camera sees
 
 

@@ -34,10 +34,10 @@ _TENTATIVE_TIME = 0.1  # seconds without agreeing cameras after which somebody u
 _GONE_TIME = 1.0  # seconds without keypoints after which a person has left
 _ALONE_TIME = 0.25  # seconds with one camera, after which its keypoints may begin somebody else
 _SAME = 0.15  # metres between joints, on average, below which two persons are one
-_SAME_TIME = 0.2  # seconds of that
+_SAME_TIME = 0.2  # seconds for which they have to be that near
 _DOUBT = 25.0  # factor of the variance of keypoints of a camera that nobody's body explains
 _LEAST_INLIERS = 0.5  # share of the keypoints of a start that must be those of a body
-_AS_WELL = 0.95  # the same share of who begins anew, against that of the body as it was followed
+_AS_WELL = 0.95  # the same of who begins anew, relative to the share of the body as it was followed
 
 
 class PeopleStream(NamedTuple):
