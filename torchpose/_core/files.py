@@ -14,6 +14,7 @@ from torchpose._core.reading import read_npz, require_file
 from torchpose.errors import OutputError
 
 __all__ = [
+    "as_output_error",
     "atomic_path",
     "check_output_folder",
     "clear_leftovers",
@@ -70,6 +71,17 @@ def clear_leftovers(folder: str | Path) -> None:
 
 
 @contextlib.contextmanager
+def as_output_error(path: Path) -> Iterator[None]:
+    """Raise an `OutputError` that names the path in place of the system's errors."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+@contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary file in the same folder that becomes `path` when the block succeeds.
 
@@ -100,18 +112,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary = path.with_name(f"{_PREFIX}{secrets.token_hex(8)}{path.suffix}")
     handle = None
     try:
-        handle = _make(temporary, path)
-        if os.name == "nt":  # an open file cannot be renamed there
-            os.close(handle)
-        yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # only its owner could read it so far
-        temporary.replace(path)
-    except OSError as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+        with as_output_error(path):
+            handle = _make(temporary, path)
+            if os.name == "nt":  # an open file cannot be renamed there
+                os.close(handle)
+            yield temporary
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o666 & ~umask)  # only its owner could read it so far
+            temporary.replace(path)
     finally:
         with contextlib.suppress(OSError):  # never made, or renamed
             temporary.unlink()

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import CONFIDENCE_ADVICE, MOST_CONFIDENCE, check_pixels, check_rate
+from torchpose._core.checks import CONFIDENCE_ADVICE, MOST_CONFIDENCE, check_pixels
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose._core.wording import counted
@@ -24,7 +24,6 @@ from torchpose.errors import (
     FileFormatError,
     InputError,
     NobodySeenError,
-    SkeletonError,
 )
 from torchpose.io._formats.keypoint_files import (
     RawKeypoints,
@@ -32,7 +31,8 @@ from torchpose.io._formats.keypoint_files import (
     read_npz_keypoints,
 )
 from torchpose.io._formats.openpose import read_openpose
-from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
+from torchpose.io._formats.raw_recording import check_names, checked_rate
+from torchpose.skeleton._joint_sets import identify_skeleton
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 from torchpose.skeleton._upper_body import NECK_KINDS, neck_of_detectors
 
@@ -234,7 +234,7 @@ def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -
     size = _check_size(path, raw.image_size)
     points, scaled = in_pixels(path, points, missing, size or image_size)
     notes = (*raw.notes, *scaled, *_note_of_filled(int(filled.sum())))
-    fps, neck = _rate_of(path, raw), _neck_of(path, raw)
+    fps, neck = checked_rate(path, raw.fps), _neck_of(path, raw)
     keypoints = Keypoints(
         torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
         None if raw.confidence is None else torch.from_numpy(confidence), fps,
@@ -260,17 +260,7 @@ def _check_points(path: Path, points: np.ndarray, names: Sequence[str]) -> None:
         raise FileFormatError(
             f"{path}: keypoints must not be infinite or beyond {_FAR:g} pixels, frame {frame}; use NaN"
         )
-    try:
-        canonical_names(names)
-    except SkeletonError as error:
-        raise SkeletonError(f"{path}: {error}") from error
-
-
-def _rate_of(path: Path, raw: RawKeypoints) -> float | None:
-    try:
-        return None if raw.fps is None else check_rate("fps", raw.fps)
-    except InputError as error:
-        raise FileFormatError(f"{path}: {error}") from error
+    check_names(path, names)
 
 
 def _neck_of(path: Path, raw: RawKeypoints) -> str | None:

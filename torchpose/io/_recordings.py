@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import check_rate
 from torchpose._core.reading import npz_keys, read_text, reading, require_file
 from torchpose._core.wording import first_of
-from torchpose.errors import FileFormatError, InputError, SkeletonError
+from torchpose.errors import FileFormatError, InputError
 from torchpose.io._formats.axes import (
     AXES,
     axes_rotation,
@@ -32,13 +31,15 @@ from torchpose.io._formats.kinect_csv import ROW_LENGTHS, is_row, read_kinect_cs
 from torchpose.io._formats.mocap_files import read_bvh, read_c3d
 from torchpose.io._formats.raw_recording import (
     RawRecording,
+    check_names,
+    checked_rate,
     frame_ranges,
     read_npz_recording,
     read_opencv_recording,
 )
 from torchpose.io._formats.skeleton_files import read_azure_json, read_kinect_v1, read_ntu_skeleton
 from torchpose.io._formats.table_rows import split_row
-from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
+from torchpose.skeleton._joint_sets import identify_skeleton
 from torchpose.skeleton._upper_body import UpperBody, to_upper_body
 
 _READERS: dict[str, Callable[[Path], list[RawRecording]]] = {
@@ -335,14 +336,8 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
     """Check the joints of a file and turn them into metres and camera axes."""
     where = raw.where()
     _check_shapes(raw)
-    try:
-        fps = None if raw.fps is None else check_rate("fps", raw.fps)
-    except InputError as error:
-        raise FileFormatError(f"{where}: {error}") from error
-    try:
-        canonical_names(raw.names)
-    except SkeletonError as error:
-        raise SkeletonError(f"{where}: {error}") from error
+    fps = checked_rate(where, raw.fps)
+    check_names(where, raw.names)
     notes = list(raw.notes)
     joints = _trusted(raw, _missing(raw, notes))
     tensor = torch.from_numpy(joints)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from torchpose._core.digests import digest_of_files
-from torchpose._core.files import atomic_path, check_output_folder, hold
+from torchpose._core.files import as_output_error, atomic_path, check_output_folder, hold
 from torchpose._core.reading import npz_keys
 from torchpose._core.wording import first_of
 from torchpose.errors import OutputError, TorchposeError
@@ -74,7 +74,7 @@ class ResultsFolder:
         check_output_folder(self.folder)
         self._refuse_inputs()
         self._refuse_strangers()
-        with _as_output_error(self.folder):
+        with as_output_error(self.folder):
             self.stage = self._take_stage()
         return self
 
@@ -98,7 +98,7 @@ class ResultsFolder:
         Raises:
             OutputError: a file cannot be moved; then everything is as it was.
         """
-        with _as_output_error(self.folder):
+        with as_output_error(self.folder):
             self._commit([path.name for path in written])
         return [self.folder / path.name for path in written]
 
@@ -197,7 +197,7 @@ def replace_own(path: str | Path, kind: str) -> Iterator[Path]:
     path = Path(path)
     with atomic_path(path) as temporary:
         yield temporary
-        with _as_output_error(path), _locked_folder(path.parent):
+        with as_output_error(path), _locked_folder(path.parent):
             listed = _read_list(path.parent, kind) or {}
             if os.path.lexists(path) and not _is_listed(path, listed):
                 path.rename(_free_folder(path.parent, [path.name]) / path.name)
@@ -350,13 +350,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink()
-
-
-@contextlib.contextmanager
-def _as_output_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

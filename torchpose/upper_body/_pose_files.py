@@ -14,6 +14,7 @@ from torchpose._core.files import atomic_path
 from torchpose.camera._tilt import level_rotation
 from torchpose.errors import InputError
 from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
+from torchpose.math._rotations import cross_matrix
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._pose_track import PoseTrack
 
@@ -177,9 +178,7 @@ def _shortest_arc(
     norm = goal.norm(dim=-1, keepdim=True)
     goal = torch.where(norm > 1e-9, goal / norm.clamp_min(1e-9), start)
     v, c = torch.linalg.cross(start, goal), (start * goal).sum(-1)
-    x, y, z = v.unbind(-1)
-    o = torch.zeros_like(x)
-    skew = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+    skew = cross_matrix(v)
     eye = torch.eye(3, dtype=goal.dtype)
     opposite = (1 + c < 1e-12)[..., None, None]
     arc = eye + skew + skew @ skew / (1 + c).clamp_min(1e-12)[..., None, None]

@@ -13,7 +13,6 @@ from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import (
     Generators,
-    check_generators,
     standard_normal,
     uniform,
 )
@@ -24,7 +23,7 @@ from torchpose.math._rotations import (
     within_half_turn,
 )
 from torchpose.whole_body._filters.annealed import anneal
-from torchpose.whole_body._filters.body_frames import silhouette_score
+from torchpose.whole_body._filters.body_frames import check_observation, silhouette_score
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 
 _ACROSS = 0.1  # metres: how far the middle of a silhouette lies from that of the body
@@ -225,10 +224,7 @@ def find_candidates(
             "a search needs at least 1 heading, 1 particle for each and 2 layers, got "
             f"{n_headings}, {n_particles} and {n_layers}"
         )
-    check_shape("silhouettes", silhouettes, ["B", "C", "H", "W"])
-    if silhouettes.dtype != torch.bool:
-        raise InputError(f"silhouettes must be bool (True = person), got {silhouettes.dtype}")
-    check_generators(generator, len(silhouettes))
+    check_observation(silhouettes, len(silhouettes), generator, plain=True)
     rig = as_rig(cameras)
     rig.check_images("silhouettes", silhouettes.shape[1:])
     up = world_up(rig, up).to(body.offsets)

@@ -1,13 +1,14 @@
 """Hold the 3D joints of a file before conversion, and read the package's .npz and the authors' .yaml."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchpose._core.checks import check_rate
 from torchpose._core.reading import (
     check_span,
     one_number,
@@ -17,8 +18,8 @@ from torchpose._core.reading import (
     reading,
     texts,
 )
-from torchpose.errors import FileFormatError
-from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.errors import FileFormatError, InputError, SkeletonError
+from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 
 SENSOR_WEIGHTS = (0.0, 0.5, 1.0)
 """Kinect's tracking states as weights: not tracked, inferred, tracked."""
@@ -80,6 +81,26 @@ def numbers(name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "fiub":
         raise FileFormatError(f"{name} must be numbers, got {array.dtype}")
     return array.astype(np.float64)
+
+
+def checked_rate(where: str | Path, fps: float | None) -> float | None:
+    """Return the frame rate of a file, None if it states none.
+
+    Raises:
+        FileFormatError: it is no rate.
+    """
+    try:
+        return None if fps is None else check_rate("fps", fps)
+    except InputError as error:
+        raise FileFormatError(f"{where}: {error}") from error
+
+
+def check_names(where: str | Path, names: Sequence[str]) -> None:
+    """Raise a `SkeletonError` that names the file, where names are of no joints, or one is there twice."""
+    try:
+        canonical_names(names)
+    except SkeletonError as error:
+        raise SkeletonError(f"{where}: {error}") from error
 
 
 def frame_ranges(frames: Iterable[int], first: int = 0) -> str:
