@@ -3,9 +3,12 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchpose._core.wording import counted, first_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Facts = dict[str, str]
 _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
@@ -185,7 +188,7 @@ def describe_body_poses(path: Path) -> Facts:
     }
 
 
-def _degrees(covariance: Any) -> list[float]:
+def _degrees(covariance: "Tensor") -> list[float]:
     """Return the standard deviation of each rotation's angle in degrees, from sines of half angles."""
     trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
     return [math.degrees(2 * math.asin(min(1.0, math.sqrt(value)))) for value in trace.tolist()]

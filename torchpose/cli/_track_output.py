@@ -10,6 +10,9 @@ from torchpose.cli._common import save_pictures
 from torchpose.cli._picture_process import PictureProcess
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpose.camera._pinhole import PinholeCamera
     from torchpose.io._results import ResultsFolder
     from torchpose.upper_body._keypoint_files import TrackSettings
     from torchpose.upper_body._pose_track import PoseTrack
@@ -111,7 +114,7 @@ def _has_poses(track: "PoseTrack") -> bool:
 
 
 def track_pictures(
-    track: "PoseTrack", truth: Any = None, labels: Any = None
+    track: "PoseTrack", truth: "Tensor | None" = None, labels: Sequence[str] | None = None
 ) -> dict[str, Callable[[], Any]]:
     """Return the pictures of one sequence by file name, each as a function that draws it."""
     from torchpose.viz._charts import prepare_joint_curves
@@ -188,13 +191,13 @@ def report_failure(track: "PoseTrack") -> int:
     return 1
 
 
-def camera_text(camera: Any) -> str:
+def camera_text(camera: "PinholeCamera") -> str:
     """Return the focal lengths and the centre of a camera in words, and where it looks if that is known."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return f"f = ({fx:g}, {fy:g}), centre ({cx:g}, {cy:g}) pixels{_tilt_text(camera)}"
 
 
-def _tilt_text(camera: Any) -> str:
+def _tilt_text(camera: "PinholeCamera") -> str:
     """Return in words by how much a camera looks up or down and is rolled; nothing if that is not known."""
     from torchpose.camera._tilt import angles_of_up
 

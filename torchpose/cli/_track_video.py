@@ -27,11 +27,16 @@ from torchpose.cli._track_output import (
 from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
+    from torchpose._core.images import Image
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.io._results import ResultsFolder
+    from torchpose.priors._upper_body_prior import UpperBodyPrior
+    from torchpose.upper_body._pose_track import PoseTrack
+    from torchpose.video._measurers import Found
     from torchpose.video._recording import TrackedPerson
-    from torchpose.video._source_interface import VideoSource
+    from torchpose.video._source_interface import VideoFrame, VideoSource
     from torchpose.video._video_tracker import VideoTracker
+    from torchpose.video._writer import VideoWriter
 
 _OVERLAY = "overlay.mp4"
 _THROUGHOUT = 0.9  # share of the frames in which a face is seen that nobody doubts
@@ -179,7 +184,7 @@ def _tracker(
     job: TrackingJob,
     options: dict[str, Any],
     face_model: str | None,
-    prior: Any,
+    prior: "UpperBodyPrior",
     camera: "PinholeCamera",
     fps: float,
 ) -> "VideoTracker":
@@ -232,7 +237,7 @@ def _track_camera(
 
         n_frames, shown, drawn = 0, None, None
 
-        def watch(image: Any, measured: Any, poses: dict[int, Any]) -> None:
+        def watch(image: "Image", measured: "Found", poses: "dict[int, PoseTrack]") -> None:
             nonlocal n_frames, shown, drawn
             n_frames += 1
             if image is not shown:  # the frames missed before it have the same one
@@ -246,7 +251,7 @@ def _track_camera(
     return people, frames.count, n_frames
 
 
-def _record(writers: list[Any], image: Any) -> None:
+def _record(writers: list["VideoWriter"], image: "Image") -> None:
     """Write a frame; where that is not possible any more, say so and stop writing."""
     try:
         writers[0].write(image)
@@ -278,7 +283,7 @@ def write_overlay(
         bar.close()
 
 
-def _first(source: "VideoSource", n_frames: int) -> Iterator[Any]:
+def _first(source: "VideoSource", n_frames: int) -> Iterator["VideoFrame"]:
     for frame in source:
         if frame.index >= n_frames:
             return
@@ -286,8 +291,11 @@ def _first(source: "VideoSource", n_frames: int) -> Iterator[Any]:
 
 
 def _drawn(
-    image: Any, tracks: dict[int, Any], frame: int | dict[int, int], measured: Any = None
-) -> Any:
+    image: "Image",
+    tracks: "dict[int, PoseTrack]",
+    frame: int | dict[int, int],
+    measured: "Found | None" = None,
+) -> "Image":
     """Return a frame with poses drawn into it, by number of the person, from a frame of their tracks.
 
     Args:

@@ -270,7 +270,7 @@ def _tracking(options: str) -> str:
     return f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {options} --out result\n```"
 
 
-def _manifold(manifold: Any, call: str) -> _Told:
+def _manifold(manifold: BackConstrainedGPLVM, call: str) -> _Told:
     info, extra = manifold.info, manifold.info.extra
     n_frames, n_columns = manifold.poses.shape
     what = (
@@ -294,7 +294,7 @@ def _manifold(manifold: Any, call: str) -> _Told:
     return what, rows, held_out, _tracking(f"--manifold {call}"), limits
 
 
-def _limbs(limbs: Any, call: str) -> _Told:
+def _limbs(limbs: LimbConditionals, call: str) -> _Told:
     info, found = limbs.info, limbs.info.extra.get("held_out")
     what = (
         f"Gaussians over the rotations between {len(limbs.edges)} pairs of connected parts, and over "
@@ -316,7 +316,7 @@ def _limbs(limbs: Any, call: str) -> _Told:
     return what, rows, held_out, _tracking(f"--method root --conditionals {call}"), limits
 
 
-def _action(space: Any, call: str) -> _Told:
+def _action(space: ActionSpace, call: str) -> _Told:
     info, accepted = space.info, space.info.extra.get("accepted")
     what = (
         f"{space.n_postures} postures of one action in {space.n_dimensions} dimensions, around which the "
@@ -328,7 +328,7 @@ def _action(space: Any, call: str) -> _Told:
     return what, rows, held_out, _tracking(f"--method constrained --action {call}"), limits
 
 
-def _bank(bank: Any, call: str) -> _Told:
+def _bank(bank: ActionBank, call: str) -> _Told:
     info = bank.info
     what = (
         f"Postures of {len(info.names)} actions, {_listed(info.names)}, and one state for none of them. The "
@@ -343,7 +343,7 @@ def _bank(bank: Any, call: str) -> _Told:
     return what, rows, _gates(info.extra.get("accepted", {})), use, limits
 
 
-def _body_motion(motion: Any, call: str) -> _Told:
+def _body_motion(motion: BodyMotion, call: str) -> _Told:
     info, found = motion.info, motion.info.extra.get("held_out")
     settings = info.extra.get("settings", {})
     n_poses = len(motion.poses.weights)

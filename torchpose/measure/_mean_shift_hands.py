@@ -3,7 +3,8 @@
 This is the paper's method, for all persons and both of their hands at once.
 """
 
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -321,7 +322,7 @@ def _measurements(
     return without_elbows(points, covariance, average.clamp(0, 1), seen)
 
 
-def _squared_distance(points: Tensor, shape: Any) -> Tensor:
+def _squared_distance(points: Tensor, shape: Sequence[int]) -> Tensor:
     """Return the squared distance of every pixel from the points [N, 2, 2], as [N, 2, H, W]."""
     x, y = points[..., None, None].unbind(2)
     across = torch.arange(shape[1]).to(points) - x
@@ -335,7 +336,7 @@ def _box_sums(length: int, side: Tensor) -> Tensor:
     return (side[..., None] / 2 + 0.5 - away).clamp(0, 1)
 
 
-def _area_inside(centre: Tensor, size: Tensor, shape: Any) -> Tensor:
+def _area_inside(centre: Tensor, size: Tensor, shape: Sequence[int]) -> Tensor:
     """Return the area of each window inside the image, pixels, at least a quarter of the window."""
     last = torch.tensor([shape[1], shape[0]]).to(centre) - 0.5
     low, high = (centre - size / 2).clamp_min(-0.5), torch.minimum(centre + size / 2, last)

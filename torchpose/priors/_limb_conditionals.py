@@ -164,7 +164,8 @@ class LimbConditionals(nn.Module):
                 f"the root part {info.parts[0]!r} conditions all others and has no edges; leave it "
                 "out of the tree"
             )
-        self.info, self.directions, self.tree = info, directions, _tree(edges, n_parts)
+        self.info, self.directions = info, directions
+        self.tree = message_tree(edges.long() - 1, n_parts - 1)  # without the root
         register_given(self, "edges", edges)
         growth = torch.ones_like(diffusion[:, 0, 0]) if growth is None else growth
         for name, value, sizes in (
@@ -357,11 +358,6 @@ def in_body_frame(
     sequences = [own.convert(states, plain) for own, several in persons for states in several]
     body = plain.altered(centres=centres_of(plain, torch.cat(sequences)))
     return body, [plain.convert(states, body) for states in sequences]
-
-
-def _tree(edges: Tensor, n_parts: int) -> Any:
-    """Return the message tree over the parts that are not the root."""
-    return message_tree(edges.long() - 1, n_parts - 1)
 
 
 def check_body_frame(body: Body) -> None:
