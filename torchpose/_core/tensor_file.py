@@ -215,7 +215,7 @@ def _checked_info(header: Any, kind: FileKind[Any]) -> str:
 
 
 def _check_tensors(
-    tensors: Mapping[str, Tensor], kind: FileKind[Any], lacking: Sequence[str] = ()
+    tensors: Mapping[str, Tensor], kind: FileKind[Any], lacking: Sequence[str]
 ) -> None:
     """Raise `FileFormatError` unless the tensors are those of the kind, some of which may be lacking."""
     expected = {**kind.tensors, **kind.indices}

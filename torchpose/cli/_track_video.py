@@ -48,7 +48,7 @@ def track_video(
     options: dict[str, Any],
     face_model: str | None,
     overlay: bool,
-    workers: int = 0,
+    workers: int,
 ) -> int:
     """Track everybody, write and report, and return the exit code: 1 if there is nobody.
 

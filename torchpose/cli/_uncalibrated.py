@@ -32,8 +32,8 @@ def camera_without_file(
     text: str,
     inputs: Sequence[str],
     videos: Sequence[str] | None,
-    tilt: float | None = None,
-    roll: float | None = None,
+    tilt: float | None,
+    roll: float | None,
 ) -> "tuple[PinholeCamera, tuple[str, ...]]":
     """Return the camera of one input, in a world whose y axis points up, and notes on what is assumed.
 

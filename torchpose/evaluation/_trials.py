@@ -186,9 +186,7 @@ class Estimate(NamedTuple):
     covariance3d: Tensor | None = None
 
 
-def own_method(
-    prior: UpperBodyPrior, fps: float | None = None, smoothing: int | str | None = None
-) -> str:
+def own_method(prior: UpperBodyPrior, fps: float | None, smoothing: int | str | None) -> str:
     """Return the default method of a prior: windows where they suit, else single poses."""
     return choose_method(prior, None, smoothing, fps, (), windows=True).method
 

@@ -292,7 +292,7 @@ def poses_by_rate(
     recordings: Sequence[Recording],
     prior: UpperBodyPrior,
     train: Sequence[Recording] | None,
-    name: str = "",
+    name: str,
 ) -> dict[float, list[Float[Tensor, "T 8 3"]]]:
     """Return complete sequences with the prior's neck, centred on it, by their frames per second.
 

@@ -135,7 +135,7 @@ def _log_density(
 
 
 def log_normaliser(
-    factor: Float[Tensor, "*batch Z Z"], mask: Bool[Tensor, "*#batch Z"], count: int | None = None
+    factor: Float[Tensor, "*batch Z Z"], mask: Bool[Tensor, "*#batch Z"], count: int | None
 ) -> Float[Tensor, "*batch"]:
     """Return -1/2 log det(2 pi S) of the first measured dimensions, of S = L L^T.
 
@@ -163,7 +163,7 @@ def own_moments(
     log_weights: Float[Tensor, "*A N K"],
     medians: Int[Tensor, "P 3"],
     return_cov: bool,
-    of_points: bool = False,
+    of_points: bool,
 ) -> tuple[Float[Tensor, "*A N D"], Tensor | None]:
     """Return the estimates of the mixture (BL 48) and, on request, their second moments about these.
 

@@ -145,7 +145,7 @@ def sequence_weights(
     rule: WeightRule,
     log_weights: Float[Tensor, "B M"],
     log_likelihood: Float[Tensor, "T B M"],
-    log_marginal: Float[Tensor, "T B M"] | None = None,
+    log_marginal: Float[Tensor, "T B M"] | None,
 ) -> tuple[Float[Tensor, "T B M"], Float[Tensor, "T B"], Float[Tensor, "B M"]]:
     """Return the weights by `step_weights` over T frames, time first.
 

@@ -59,7 +59,7 @@ def fit_action_space(
 
 def fit_synchronised(
     performances: Sequence[Float[Tensor, "_ 36"]],
-    n_dimensions: int = 13,
+    n_dimensions: int,
     *,
     name: str = "",
     fps: float | None = None,

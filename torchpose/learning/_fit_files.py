@@ -36,7 +36,7 @@ def check_fit_file(name: str | Path) -> Path:
     return out
 
 
-def fit_results(out: Path, inputs: Iterable[str | Path], pictures: bool = True) -> ResultsFolder:
+def fit_results(out: Path, inputs: Iterable[str | Path], pictures: bool) -> ResultsFolder:
     """Return the results folder of a fit: its file, and those of the same name beside it.
 
     Args:
@@ -85,7 +85,7 @@ def write_fit(
 
 
 def write_prior_files(
-    prior: UpperBodyPrior, results: ResultsFolder, file: str, picture: bool = False
+    prior: UpperBodyPrior, results: ResultsFolder, file: str, picture: bool
 ) -> str:
     """Write a prior of the upper body, its card and a picture of its mean poses; return a report.
 

@@ -292,10 +292,10 @@ def best_fit(
     make: Callable[[int], GPLVMFit],
     n_init: int,
     steps: int,
-    tolerance: float = 1e-5,
-    progress: bool = False,
-    error: Callable[[GPLVMFit], float] | None = None,
-    patience: int = 3,
+    tolerance: float,
+    progress: bool,
+    error: Callable[[GPLVMFit], float] | None,
+    patience: int,
 ) -> GPLVMFit:
     """Fit from several starts and return the fit with the lowest error, or else the highest objective.
 

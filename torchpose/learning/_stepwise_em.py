@@ -75,8 +75,8 @@ def stepwise_update(
     em: StreamedEM,
     state: StepwiseState,
     statistics: SufficientStatistics,
-    power: float = POWER,
-    offset: float = OFFSET,
+    power: float,
+    offset: float,
 ) -> StepwiseState:
     """Blend the statistics of a few blocks in, and move the mixture.
 

@@ -208,8 +208,8 @@ def run_streamed(
     em: StreamedEM,
     source: SampleSource,
     *,
-    max_iter: int = 200,
-    tol: float = 1e-4,
+    max_iter: int,
+    tol: float,
     share: Share = ALONE,
     progress: bool = False,
 ) -> None:

@@ -95,7 +95,7 @@ class MixtureFit(nn.Module):
         shift: Float[Tensor, " D"],
         factor: Float[Tensor, "D D"],
         variances: Float[Tensor, " D"],
-        dtype: torch.dtype = torch.float64,
+        dtype: torch.dtype,
     ) -> Self:
         """Return the fit of a mixture that is given in the units of the points.
 

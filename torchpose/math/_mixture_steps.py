@@ -189,7 +189,7 @@ def e_step(
 def feature_sums(
     x: Float[Tensor, "N D"],
     theta: Float[Tensor, "K F"],
-    sample_weight: Float[Tensor, " N"] | None = None,
+    sample_weight: Float[Tensor, " N"] | None,
 ) -> SufficientStatistics:
     """Run the expectation step of a mixture whose terms are theta_k . phi(x), without a graph.
 

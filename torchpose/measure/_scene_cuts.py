@@ -52,7 +52,7 @@ class SceneCuts:
         fps: frames per second.
     """
 
-    def __init__(self, fps: float = 30.0) -> None:
+    def __init__(self, fps: float) -> None:
         self._decay = 0.5 ** (1 / (_MEMORY * fps))
 
     def init(self) -> SceneState:

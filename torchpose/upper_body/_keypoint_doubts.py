@@ -48,14 +48,12 @@ def refuse_another_size(keypoints: Keypoints, size: tuple[int, int] | None) -> N
         )
 
 
-def doubts_about(
-    keypoints: Keypoints, neck_is_told: bool, up: Tensor | None = None
-) -> Iterator[str]:
+def doubts_about(keypoints: Keypoints, neck_is_told: bool, up: Tensor | None) -> Iterator[str]:
     """Yield a note on each doubt about the keypoints of a file.
 
     Args:
         keypoints: of a file. neck_is_told: whether their neck is known to be the prior's, or not to be.
-        up: the direction that points up, camera axes, [3]; by default the camera is about level.
+        up: the direction that points up, camera axes, [3]; None if the camera is about level.
     """
     if crowd := said_of_crowd(keypoints.n_people, keypoints.keypoints):
         yield crowd

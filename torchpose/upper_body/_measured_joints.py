@@ -201,7 +201,7 @@ def measure_joints(
     confidence: Tensor | None,
     indices: Sequence[int],
     cov: Float[Tensor, "8 2 2"],
-    own_cov: Float[Tensor, "B T J 2 2"] | None = None,
+    own_cov: Float[Tensor, "B T J 2 2"] | None,
 ) -> MeasuredJoints:
     """Return the eight joints among the keypoints, in the pixels of the keypoints.
 

@@ -14,7 +14,7 @@ _TAKEN, _EXCHANGED = "taken as outliers, as if missing", "left and right exchang
 
 def outlier_notes(
     probability: Float[Tensor, "B T 8"],
-    exchanged: Bool[Tensor, "B T"] | int = 0,
+    exchanged: Bool[Tensor, "B T"] | int,
     lengths: Int[Tensor, " B"] | None = None,
 ) -> tuple[str, ...]:
     """Return a note about outliers and exchanged hands; nothing where there were none.

@@ -66,8 +66,8 @@ def see_in_view(
     prior: UpperBodyPrior,
     layout: WindowLayout,
     measurement_cov: Float[Tensor, "8 2 2"],
-    lengths: Int[Tensor, " B"] | None = None,
-    start: int = 0,
+    lengths: Int[Tensor, " B"] | None,
+    start: int,
 ) -> SeenInView:
     """Return the measurements of windows in a virtual camera that follows the body, from a frame on.
 

@@ -34,7 +34,7 @@ def look_ahead_elsewhere(
     state: Any,
     images: Iterable[tuple[Image, int]],
     n_frames: int | None,
-    ahead: int = AHEAD,
+    ahead: int,
 ) -> Generator[SeenFrame, None, None]:
     """Yield the frames of `look_ahead`, from a thread at first, and from another process once it has started.
 

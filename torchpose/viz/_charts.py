@@ -85,10 +85,10 @@ def plot_joint_curves(
 
 def prepare_joint_curves(
     joints: Float[Tensor, "T 8 D"],
-    covariance: Float[Tensor, "T 8 D D"] | None = None,
-    observed: Bool[Tensor, "T 8"] | None = None,
-    truth: Float[Tensor, "T 8 D"] | None = None,
-    fps: float = 30.0,
+    covariance: Float[Tensor, "T 8 D D"] | None,
+    observed: Bool[Tensor, "T 8"] | None,
+    truth: Float[Tensor, "T 8 D"] | None,
+    fps: float,
     show: Sequence[str] = CURVE_JOINTS,
     level: float = 0.9,
     title: str | None = None,

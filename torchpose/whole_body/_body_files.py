@@ -41,7 +41,7 @@ class BodyMotion3d(NamedTuple):
     feet: BodyFeet | None = None
 
 
-def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None = None) -> None:
+def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None) -> None:
     """Write a motion as ``.trc``, ``.c3d`` or ``.bvh``, by the suffix.
 
     Args:
@@ -139,7 +139,7 @@ def _toes(
     return _CENTIMETRES * (rotations.mT @ away[..., None]).squeeze(-1).median(0).values
 
 
-def _part_nodes(body: Body, toes: Sequence[Float[Tensor, "3"]] = ()) -> list[_PartNode]:
+def _part_nodes(body: Body, toes: Sequence[Float[Tensor, "3"]]) -> list[_PartNode]:
     """Return a node for every joint, depth first, and one for every further part that turns about it.
 
     Args:

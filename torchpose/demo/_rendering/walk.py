@@ -247,7 +247,7 @@ def empty_scene(camera: PinholeCamera, seed: int = 0) -> Array:
 
 
 def render_body_video(
-    folder: str | Path, walk: Walk, cameras: list[PinholeCamera], seed: int = 0
+    folder: str | Path, walk: Walk, cameras: list[PinholeCamera], seed: int
 ) -> tuple[list[Path], list[Path]]:
     """Write a video for each camera, NAME.mp4, and a picture of its empty scene, NAME-empty.png.
 

@@ -230,7 +230,7 @@ class ManifoldFitting(nn.Module):
 
 
 def run_to_end(
-    fitting: ManifoldFitting, kept: str | Path | None = None, progress: bool = False
+    fitting: ManifoldFitting, kept: str | Path | None, progress: bool
 ) -> ManifoldFitting:
     """Take steps until the fit is finished.
 

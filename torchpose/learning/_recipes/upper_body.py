@@ -321,7 +321,7 @@ class UpperBodyRecipe:
         return WindowPrior(left, right, self.layouts[mode], _window_settings(mode))
 
     def calibrate(
-        self, prior: UpperBodyPrior, recordings: Sequence[RecordingLike], progress: bool = False
+        self, prior: UpperBodyPrior, recordings: Sequence[RecordingLike], progress: bool
     ) -> UpperBodyPrior:
         """Hold groups of persons out in turn, and calibrate the prior by the errors on them.
 

@@ -54,7 +54,7 @@ def no_noise(latent_dim: int, columns: int, like: Tensor) -> MotionNoise:
 
 
 def join_sequences(
-    poses: Tensor | Sequence[Tensor], columns: Sequence[str] = (), dim: int | None = None
+    poses: Tensor | Sequence[Tensor], columns: Sequence[str], dim: int | None = None
 ) -> tuple[Float[Tensor, "T Q"], list[int]]:
     """Return the poses of all sequences as one matrix in double precision, and how long each is.
 

@@ -64,9 +64,9 @@ def pack_array(array: np.ndarray) -> dict[str, Any]:
 def pack_person(
     track: ReportedTrack,
     label: str,
-    first_frame: int = 0,
-    truth: Float[Tensor, "T J 3"] | None = None,
-    max_poses: int = MAX_POSES,
+    first_frame: int,
+    truth: Float[Tensor, "T J 3"] | None,
+    max_poses: int,
 ) -> tuple[dict[str, Any], Thinned]:
     """Return the data of one person in the page.
 

@@ -73,8 +73,8 @@ def see_frame(
     observed: Tensor,
     cameras: Any,
     likelihood: str | Likelihood,
-    sharpness: float = 1.0,
-    limb_shape: str = "cylinders",
+    sharpness: float,
+    limb_shape: str,
 ) -> Frame:
     """Return the frame of some observations, with the exponent of the likelihood.
 

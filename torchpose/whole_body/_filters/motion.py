@@ -98,7 +98,7 @@ def std_of_covariance(name: str, cov: Tensor | float, dim: int) -> Float[Tensor,
 
 
 def diffusion_std(
-    body: PoseSpace, process_cov: Tensor | float | None, step_std: Tensor | float | None = None
+    body: PoseSpace, process_cov: Tensor | float | None, step_std: Tensor | float | None
 ) -> Float[Tensor, " D"]:
     """Return the standard deviations of a filter's diffusion, in the dtype and on the device of the body.
 

@@ -47,7 +47,7 @@ def doubt_cameras(
     joints: Float[Tensor, "T J 3"],
     fps: float,
     exchange: Exchange,
-    turns: bool = True,
+    turns: bool,
 ) -> CameraDoubts:
     """Return by what cameras seem to be wrong, from one adjustment about the tracked joints.
 

@@ -87,8 +87,8 @@ def refine_cameras(
     fps: float,
     what: str,
     exchange: Exchange,
-    smoothing: bool = False,
-    turn: Float[Tensor, "C 3 3"] | None = None,
+    smoothing: bool,
+    turn: Float[Tensor, "C 3 3"] | None,
 ) -> RefinedCameras:
     """Return cameras without the errors that keypoints tell of.
 
@@ -213,7 +213,7 @@ def given_for(
     free: Bool[Tensor, "C 7"],
     fps: float,
     exchange: Exchange,
-    stride: int = 1,
+    stride: int,
 ) -> BundleInputs:
     """Return what cameras are adjusted to: every frame, or each after a stride.
 

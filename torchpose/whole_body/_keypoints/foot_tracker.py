@@ -55,7 +55,7 @@ def track_feet(
     maps: RigMaps,
     poses: KeypointPoses,
     frames: KeypointFrame,
-    smoothing: bool = False,
+    smoothing: bool,
 ) -> FootPoses:
     """Return the feet of whole sequences.
 

@@ -48,7 +48,7 @@ def notes_of(
     alone: Int[Tensor, " T"],
     off: Bool[Tensor, "T C"],
     sized: bool,
-    first_frame: int = 0,
+    first_frame: int,
 ) -> tuple[str, ...]:
     """Return notes on the keypoints of a track.
 
@@ -167,7 +167,7 @@ def notes_on_still_cameras(
 
 
 def notes_on_left_out_cameras(
-    cameras: Sequence[str], off: Bool[Tensor, "T C"], first_frame: int = 0
+    cameras: Sequence[str], off: Bool[Tensor, "T C"], first_frame: int
 ) -> tuple[str, ...]:
     """Return notes on cameras that were left out.
 
@@ -183,7 +183,7 @@ def notes_on_left_out_cameras(
 
 
 def notes_on_turned_cameras(
-    cameras: Sequence[str], turns: Float[Tensor, "T C"], first_frame: int = 0
+    cameras: Sequence[str], turns: Float[Tensor, "T C"], first_frame: int
 ) -> tuple[str, ...]:
     """Return a note on cameras whose keypoints were turned back, if there are any.
 

@@ -90,7 +90,7 @@ class PeopleTracker:
         tracker: of single persons. most: persons at a time, None for any number.
     """
 
-    def __init__(self, tracker: KeypointTracker, most: int | None = None) -> None:
+    def __init__(self, tracker: KeypointTracker, most: int | None) -> None:
         self.tracker, self.most = tracker, most
         self.n_cameras = len(tracker.filter.maps.shift)
         self.agreeing = min(2, self.n_cameras)
