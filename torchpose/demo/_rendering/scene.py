@@ -56,7 +56,7 @@ def room(width: int, height: int, scene: Scene, seed: int = 0) -> Array:
     if scene.clutter:
         wide = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
         large = np.clip(wide, 0, 255).astype(np.uint8)
-        _Furniture(large, rng).draw()
+        _furnish(large, rng)
         soft = cv2.GaussianBlur(large, (0, 0), 2 * max(width / 640, 0.4))
         small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
         picture = small.astype(np.float32)
@@ -64,82 +64,55 @@ def room(width: int, height: int, scene: Scene, seed: int = 0) -> Array:
     return np.clip(picture + 0.8 * plaster[..., None], 0, 255).astype(np.float32)
 
 
-class _Furniture:
-    """Draws furniture into the picture of a room, some of it of the colour of skin."""
+def _furnish(picture: Image, rng: np.random.Generator) -> None:
+    """Draw a board, a shelf with books, a monitor with a skin-coloured picture, a chair, skirting."""
+    import cv2
 
-    def __init__(self, picture: Image, rng: np.random.Generator) -> None:
-        self._picture, self._rng = picture, rng
-        self._size = picture.shape[1], picture.shape[0]
+    height, width = picture.shape[:2]
 
-    def draw(self) -> None:
-        """Draw all of it."""
-        self._floor()
-        self._board()
-        self._shelf()
-        self._table()
-        self._chair()
-
-    def _box(self, left: float, top: float, right: float, bottom: float, colour: NDArray) -> None:
-        import cv2
-
-        width, height = self._size
+    def box(left: float, top: float, right: float, bottom: float, colour: NDArray) -> None:
         corners = [(left * width, top * height), (right * width, bottom * height)]
         a, b = ((round(u), round(v)) for u, v in corners)
-        cv2.rectangle(self._picture, a, b, [float(c) for c in colour], -1, cv2.LINE_AA)
+        cv2.rectangle(picture, a, b, [float(c) for c in colour], -1, cv2.LINE_AA)
 
-    def _shade(self, colour: tuple[float, float, float], spread: float = 6) -> NDArray:
-        return np.clip(np.array(colour) + self._rng.uniform(-spread, spread, 3), 0, 255)
+    def shade(colour: tuple[float, float, float], spread: float = 6) -> NDArray:
+        return np.clip(np.array(colour) + rng.uniform(-spread, spread, 3), 0, 255)
 
-    def _floor(self) -> None:
-        """Draw the floor and the skirting board."""
-        self._box(0, 0.90, 1, 1, self._shade((128, 112, 98)))
-        self._box(0, 0.875, 1, 0.90, self._shade((222, 222, 218)))
-
-    def _board(self) -> None:
-        """Draw a board with notes on the wall, a little askew as boards are."""
-        shift = self._rng.uniform(-0.02, 0.02)
-        board = np.array([(0.70, 0.16), (0.93, 0.13), (0.935, 0.60), (0.705, 0.585)])
-        board[:, 0] += shift
-        middle = board.mean(0)
-        self._polygon((board - middle) * 1.05 + middle, self._shade((226, 228, 230)))
-        self._polygon(board, self._shade((52, 96, 142)))
-        for _ in range(3):
-            u, v = self._rng.uniform(0.73, 0.88) + shift, self._rng.uniform(0.2, 0.5)
-            self._box(u, v, u + 0.03, v + 0.05, self._shade((206, 204, 178), 18))
-
-    def _polygon(self, corners: NDArray, colour: NDArray) -> None:
-        import cv2
-
-        sixteenths = np.round(corners * self._size * 16).astype(np.int32)
-        cv2.fillPoly(self._picture, [sixteenths], colour.tolist(), cv2.LINE_AA, 4)
-
-    def _shelf(self) -> None:
-        """Draw a shelf with books."""
-        left = 0.03 + self._rng.uniform(-0.01, 0.02)
-        self._box(left, 0.28, left + 0.20, 0.30, self._shade((104, 82, 64)))
+    # Floor and skirting board.
+    box(0, 0.90, 1, 1, shade((128, 112, 98)))
+    box(0, 0.875, 1, 0.90, shade((222, 222, 218)))
+    # A board on the wall, a little askew as boards are.
+    shift = rng.uniform(-0.02, 0.02)
+    board = np.array([(0.70, 0.16), (0.93, 0.13), (0.935, 0.60), (0.705, 0.585)])
+    board[:, 0] += shift
+    corners = np.round(board * (width, height) * 16).astype(np.int32)
+    frame = np.round(((board - board.mean(0)) * 1.05 + board.mean(0)) * (width, height) * 16)
+    cv2.fillPoly(picture, [frame.astype(np.int32)], shade((226, 228, 230)).tolist(), cv2.LINE_AA, 4)
+    cv2.fillPoly(picture, [corners], shade((52, 96, 142)).tolist(), cv2.LINE_AA, 4)
+    for _ in range(3):  # notes
+        u, v = rng.uniform(0.73, 0.88) + shift, rng.uniform(0.2, 0.5)
+        box(u, v, u + 0.03, v + 0.05, shade((206, 204, 178), 18))
+    # A shelf with books.
+    left = 0.03 + rng.uniform(-0.01, 0.02)
+    box(left, 0.28, left + 0.20, 0.30, shade((104, 82, 64)))
+    at = left + 0.008
+    while at < left + 0.165:
+        thick, tall = rng.uniform(0.011, 0.02), rng.uniform(0.09, 0.15)
         spine = ((70, 84, 110), (118, 56, 52), (82, 104, 82), (170, 164, 148), (58, 58, 64))
-        at = left + 0.008
-        while at < left + 0.165:
-            thick, tall = self._rng.uniform(0.011, 0.02), self._rng.uniform(0.09, 0.15)
-            shade = self._shade(spine[self._rng.integers(len(spine))], 14)
-            self._box(at, 0.28 - tall, at + thick, 0.279, shade)
-            at += thick + 0.002
-
-    def _table(self) -> None:
-        """Draw a table with a monitor that shows something of the colour of skin."""
-        self._box(0, 0.725, 0.235, 0.745, self._shade((148, 116, 86)))
-        self._box(0.01, 0.745, 0.03, 0.90, self._shade((112, 88, 66)))
-        self._box(0.195, 0.745, 0.215, 0.90, self._shade((112, 88, 66)))
-        self._box(0.085, 0.68, 0.115, 0.725, self._shade((48, 50, 54)))
-        self._box(0.01, 0.43, 0.195, 0.685, self._shade((36, 38, 42)))
-        self._box(0.02, 0.447, 0.185, 0.668, self._shade((214, 176, 150)))
-        self._box(0.03, 0.47, 0.10, 0.65, self._shade((192, 138, 110)))
-
-    def _chair(self) -> None:
-        """Draw a chair at the right."""
-        self._box(0.84, 0.66, 0.985, 0.82, self._shade((54, 58, 66)))
-        self._box(0.82, 0.80, 1.0, 0.84, self._shade((44, 47, 54)))
-        self._box(0.90, 0.84, 0.92, 0.98, self._shade((70, 72, 78)))
+        box(at, 0.28 - tall, at + thick, 0.279, shade(spine[rng.integers(len(spine))], 14))
+        at += thick + 0.002
+    # A table with a monitor that shows something of the colour of skin.
+    box(0, 0.725, 0.235, 0.745, shade((148, 116, 86)))
+    box(0.01, 0.745, 0.03, 0.90, shade((112, 88, 66)))
+    box(0.195, 0.745, 0.215, 0.90, shade((112, 88, 66)))
+    box(0.085, 0.68, 0.115, 0.725, shade((48, 50, 54)))
+    box(0.01, 0.43, 0.195, 0.685, shade((36, 38, 42)))
+    box(0.02, 0.447, 0.185, 0.668, shade((214, 176, 150)))
+    box(0.03, 0.47, 0.10, 0.65, shade((192, 138, 110)))
+    # A chair at the right.
+    box(0.84, 0.66, 0.985, 0.82, shade((54, 58, 66)))
+    box(0.82, 0.80, 1.0, 0.84, shade((44, 47, 54)))
+    box(0.90, 0.84, 0.92, 0.98, shade((70, 72, 78)))
 
 
 class Sensor:
