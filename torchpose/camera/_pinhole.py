@@ -97,7 +97,8 @@ class PinholeCamera(NoHalfModule):
         self.register_buffer("distortions", _vector(f"distortions of {label}", distortions, None))
         self.register_buffer("rotation", _turn(f"rotation of {label}", rotation))
         self.register_buffer("translation", _vector(f"translation of {label}", translation, 3))
-        self.register_buffer("up", _direction(f"up of {label}", up))
+        where = f"up of {label}"
+        self.register_buffer("up", None if up is None else unit_up(where, _vector(where, up, 3)))
 
     @classmethod
     def from_matrix(
@@ -415,10 +416,6 @@ def _turn(name: str, values: Any) -> Tensor:
             f"{_LARGEST_TURN:g}, got {turn.tolist()}; give degrees as radians"
         )
     return turn
-
-
-def _direction(name: str, up: Any) -> Tensor | None:
-    return None if up is None else unit_up(name, _vector(name, up, 3))
 
 
 def _numbers(name: str, values: Any, wanted: str = "numbers") -> Tensor:

@@ -164,7 +164,7 @@ class Command(NamedTuple):
             while leading >= by_place and rest and not rest[0].startswith("--"):
                 items.append(rest.pop(0))
             one = len(items) == 1 and ("[" in items[0] or "," not in items[0])
-            words.append(items[0] if one else f"[{','.join(map(_bare, items))}]")
+            words.append(items[0] if one else f"[{','.join(i.strip('[], ') for i in items)}]")
         return words
 
     def main(self, arguments: Sequence[str]) -> int:
@@ -254,11 +254,6 @@ def _add(parser: ArgumentParser, option: Option, kind: Any, metavar: str) -> Non
     settings |= {"required": True} if required else {"default": default}
     action = parser.add_argument(option.flag, **settings)
     action.option_strings = [option.flag]  # of lists also with a +, which the help need not show
-
-
-def _bare(word: str) -> str:
-    """Return an item of a list without what stands around it."""
-    return word.strip("[], ")
 
 
 def _item(kind: Any) -> Any:

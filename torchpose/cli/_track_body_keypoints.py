@@ -291,6 +291,7 @@ def _facts(
     source = "files" if settings.detector is None else settings.detector.where
     source += ", with silhouettes" if settings.silhouettes is not None else ""
     n_cameras = len(keypoints.cameras)
+    tracked = len(people[0]) if len(people) == 1 else len(keypoints.points)
     everybody = settings.persons is not None
     agreement = {}
     if everybody:
@@ -308,14 +309,8 @@ def _facts(
         + smoothing_text("full" if settings.smoothing == "full" else None),
         "body": _body_text(people, settings),
         **{name: fact for name, fact in agreement.items() if fact},
-        "speed": f"{_number_of_frames(keypoints, people) / max(seconds, 1e-9):.1f} frames a second, "
-        "without drawing",
+        "speed": f"{tracked / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
-
-
-def _number_of_frames(keypoints: BodyKeypoints, people: "Sequence[BodyTrack]") -> int:
-    """Return the number of frames that were tracked."""
-    return len(people[0]) if len(people) == 1 else len(keypoints.points)
 
 
 def _body_text(people: "Sequence[BodyTrack]", settings: KeypointSettings) -> str:

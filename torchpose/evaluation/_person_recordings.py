@@ -93,14 +93,10 @@ def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
     groups: dict[str, list[Recording]] = {}
     for recording in recordings:
         groups.setdefault(recording.person_id, []).append(recording)
-    short = {key: _short_name(group[0]) for key, group in groups.items()}
+    short = {key: one.person or _folder(one) or "one" for key, (one, *_) in groups.items()}
     names = [*short.values(), *groups]
     unique = {key: name if names.count(name) == 1 else key for key, name in short.items()}
     return {unique[key]: groups[key] for key in sorted(groups, key=lambda k: _natural(unique[k]))}
-
-
-def _short_name(recording: Recording) -> str:
-    return recording.person or _folder(recording) or "one"
 
 
 def _folder(recording: Recording) -> str:

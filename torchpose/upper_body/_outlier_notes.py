@@ -31,7 +31,8 @@ def outlier_notes(
         )
         outliers = outliers & inside[..., None]
         exchanged = exchanged & inside if isinstance(exchanged, Tensor) else exchanged
-    counts, frames, said = outliers.flatten(0, 1).sum(0).tolist(), _number_of(exchanged), []
+    counts, said = outliers.flatten(0, 1).sum(0).tolist(), []
+    frames = int(exchanged.sum()) if isinstance(exchanged, Tensor) else exchanged
     if any(counts):
         joints = [f"{name} {n}" for name, n in zip(UPPER_BODY, counts, strict=True) if n]
         said.append(f"{counted(sum(counts), 'keypoint')} {_TAKEN}: {', '.join(joints)}")
@@ -49,7 +50,3 @@ def exchanged_frames(notes: Iterable[str]) -> int:
     """Return the number of frames with exchanged hands in the notes of `outlier_notes`."""
     found = (re.search(rf"{_EXCHANGED} (\d+) frame", note) for note in notes)
     return sum(int(match[1]) for match in found if match)
-
-
-def _number_of(frames: Bool[Tensor, "B T"] | int) -> int:
-    return int(frames.sum()) if isinstance(frames, Tensor) else frames

@@ -16,7 +16,6 @@ from torchpose.camera._tilt import Turn, up_of_angles
 from torchpose.camera._virtual_camera import BodyView
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.filters._mkf import MixtureKalmanFilter
-from torchpose.filters._outputs import FilterOutput
 from torchpose.filters._recursive_filter import RecursiveFilter
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -303,7 +302,7 @@ class SinglePoses(Estimator):
                     return_cov=True,
                     progress=progress,
                 )
-            arms[side] = _wide(out)
+            arms[side] = in_double(out._replace(cov=require_cov(out)))
         return state._replace(filters=filters), Estimates(arms["left"], arms["right"], view)
 
     def forward(
@@ -372,8 +371,3 @@ class SinglePoses(Estimator):
             torch.cat([mask, torch.ones_like(mask[..., :2])], -1),
             torch.nn.functional.pad(cov, (0, 2, 0, 2)) + noise,
         )
-
-
-def _wide(out: FilterOutput) -> FilterOutput:
-    """Return the estimates in float64; raise if they lack covariances."""
-    return in_double(out._replace(cov=require_cov(out)))

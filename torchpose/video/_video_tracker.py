@@ -417,7 +417,7 @@ class VideoTracker(nn.Module):
         before = {} if cut else state.streams
         streams, tracked = self.stream.advance_all(before, found, images, self.gap)
         last = {number: tracked[number][-1].poses for number in streams}
-        poses = {number: pose for number, pose in last.items() if _ends_in_pose(pose)}
+        poses = {n: pose for n, pose in last.items() if bool(pose.joints3d[:, -1].isfinite().all())}
         cuts = (*state.cuts, state.n_frames) if cut else state.cuts
         return VideoState(own, streams, poses, state.n_frames + len(found), cuts), tracked
 
@@ -490,7 +490,3 @@ def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
         n: Candidates(pose.joints2d[0, -1, _HANDS], pose.covariance2d[0, -1, _HANDS])
         for n, pose in poses.items()
     }
-
-
-def _ends_in_pose(track: PoseTrack) -> bool:
-    return bool(track.joints3d[:, -1].isfinite().all())

@@ -207,7 +207,9 @@ def body_unit(where: str, joints: Float[Tensor, "T J 3"], names: Sequence[str]) 
     Raises:
         FileFormatError: neither of the three makes a body.
     """
-    span = _median((_largest(joints) - _smallest(joints)).amax(-1))
+    missing = joints.isnan()
+    low, high = joints.masked_fill(missing, math.inf), joints.masked_fill(missing, -math.inf)
+    span = _median((high.amax(1) - low.amin(1)).amax(-1))
     shoulders = _shoulder_width(joints, names)
     if span is None or (span <= _LARGEST and not 0 < (shoulders or 1.0) < _NARROWEST):
         return Unit(1.0, "")
@@ -232,14 +234,6 @@ def _shoulder_width(joints: Tensor, names: Sequence[str]) -> float | None:
         return None
     across = joints[:, index["shoulder_left"]] - joints[:, index["shoulder_right"]]
     return _median(across.norm(dim=-1))
-
-
-def _largest(joints: Tensor) -> Tensor:
-    return torch.where(joints.isnan(), -math.inf, joints).amax(1)
-
-
-def _smallest(joints: Tensor) -> Tensor:
-    return torch.where(joints.isnan(), math.inf, joints).amin(1)
 
 
 def _median(values: Tensor) -> float | None:

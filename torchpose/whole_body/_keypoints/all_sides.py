@@ -21,7 +21,7 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
     Args:
         filter: of two cameras or more. frames: keypoints [T, C, J].
     """
-    told = _telling(frames)
+    told = frames.some(((frames.inlier > 0).sum(1) >= 2).sum(-1) >= _LEAST_JOINTS, _FRAMES)
     gains = torch.zeros(0)
     for part in zip(*(value.split(_AT_A_TIME) for value in told), strict=True):
         gains = torch.cat([gains, _gains(filter, KeypointFrame(*part)).cpu()])
@@ -34,11 +34,6 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
         f"(log-evidence {float(gains.sum()):.0f} more, in {counted(len(gains), 'frame')}), so people may "
         "look backwards; check the names of the keypoints, and whether all videos are mirrored",
     )
-
-
-def _telling(frames: KeypointFrame) -> KeypointFrame:
-    """Return frames [N, C, J], of those in which two cameras see most joints."""
-    return frames.some(((frames.inlier > 0).sum(1) >= 2).sum(-1) >= _LEAST_JOINTS, _FRAMES)
 
 
 def _gains(filter: BodyKalmanFilter, frames: KeypointFrame) -> Float[Tensor, " N"]:

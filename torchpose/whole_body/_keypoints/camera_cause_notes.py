@@ -83,7 +83,8 @@ def find_cause(rig: CameraRig, frames: KeypointFrame) -> CameraCause | None:
     Args:
         rig: two cameras or more. frames: keypoints [T, C, J].
     """
-    some = _some_frames(without_still_frames(frames))
+    moving = without_still_frames(frames)
+    some = moving.some((moving.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
     count = float((some.inlier * ((some.inlier > 0).sum(1, keepdim=True) >= 2)).sum())
     if count < _LEAST_KEYPOINTS:
         return None
@@ -172,11 +173,6 @@ def _alike(one: _Tried, other: _Tried) -> bool:
     lens = ("lens", "raw")
     same = one.kind == other.kind or (one.kind in lens and other.kind in lens)
     return same and one.camera == other.camera
-
-
-def _some_frames(frames: KeypointFrame) -> KeypointFrame:
-    """Return frames, few enough, in which two cameras see the person."""
-    return frames.some((frames.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
 
 
 def _repeated(frames: KeypointFrame, count: int) -> KeypointFrame:
