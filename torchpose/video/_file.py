@@ -89,7 +89,7 @@ class FileSource(VideoSource):
         self._decoded = self._decode()
         self._first = next(self._decoded, None)
         if self._first is None:
-            raise FileFormatError(f"{self.path}: {_why_no_frame(self.path, scan)}")
+            raise FileFormatError(f"{self.path}: {_why_no_frame(scan)}")
         frame = self._first
         self._turn, odd = _orientation(frame)
         self._raw_size = (frame.width, frame.height)
@@ -300,7 +300,7 @@ class FileSource(VideoSource):
             self.notes.append(f"{' and '.join(done)} to keep {self.fps:.6g} frames per second")
 
 
-def _why_no_frame(path: Path, scan: Scan) -> str:
+def _why_no_frame(scan: Scan) -> str:
     if scan.frames == 0:
         return "expected a video, got one with zero frames"
     return f"none of its {counted(scan.frames, 'frame')} can be decoded; the file is damaged"

@@ -125,7 +125,7 @@ def curate(recordings: Sequence[Recording], settings: CurationSettings = DEFAULT
     if settings.mirror:
         kept += [mirrored(r) for r in kept]
     report = CurationReport(
-        _size(recordings), after, tuple(drops), _notes(recordings, settings), settings._asdict()
+        _size(recordings), after, tuple(drops), _notes(recordings), settings._asdict()
     )
     return Curated(kept, report)
 
@@ -274,7 +274,7 @@ def _size(recordings: Sequence[Recording]) -> Size:
     return Size(persons, len(recordings), sum(map(len, recordings)), joints)
 
 
-def _notes(recordings: Sequence[Recording], settings: CurationSettings) -> tuple[str, ...]:
+def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Return notes on all recordings together, then those of single ones, alike ones once."""
     notes = [*_same_folders(recordings), *same_names(recordings), *unstated_rates(recordings)]
     sets = skeleton_counts(recordings)

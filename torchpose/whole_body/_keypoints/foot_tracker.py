@@ -78,8 +78,7 @@ def track_feet(
         return filtered
     states, filtered = found.sequence
     smoothed = smooth_feet(filter, states, poses.started)
-    feet = by_parts(filter.poses, smoothed, every, filtered.inlier)
-    return feet
+    return by_parts(filter.poses, smoothed, every, filtered.inlier)
 
 
 def smooth_feet(
