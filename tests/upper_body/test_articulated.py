@@ -557,6 +557,49 @@ def test_smoothing_sums_over_all_later_paths():
             torch.testing.assert_close(found[t].weight, brute(t, last))
 
 
+def test_what_is_known_of_an_arm_outlasts_frames_without_it():
+    """Its hypotheses go on for 0.2 s with their weights, and later frames are told to earlier ones."""
+    chain = ArticulatedFilter(TrackerModel(tracker(), PRIOR, tracker().measurement_cov, 30.0)).chain
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(10, 1, 2, 5, 2, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(directions, dim=-1).flatten(-2)
+    said = torch.rand(10, 1, 2, 5, generator=generator, dtype=torch.float64)
+    arms = [Arms(d[:, :, None], w.log()[:, :, None], torch.zeros_like(w)[:, :, None])
+            for d, w in zip(directions, said, strict=True)]  # fmt: skip
+    both, right = torch.tensor([[True, True]]), torch.tensor([[False, True]])
+    states = [chain.start(arms[0], both)]
+    for t in range(1, 9):
+        states.append(chain.update(states[-1], arms[t], right, told=right))
+    states.append(chain.update(states[-1], arms[9], both, told=both))
+    assert states[6].missed[0].tolist() == pytest.approx([0.2, 0.0])
+    for state in states[1:7]:
+        torch.testing.assert_close(state.weight[:, 0], states[0].weight[:, 0])
+        moved = (state.directions - directions[0])[:, 0].norm(dim=-1)
+        assert 0.0 < float(moved.mean()) < 0.5
+        assert float(state.log_evidence[0, 0]) == 0.0
+    for t in (7, 8, 9):
+        torch.testing.assert_close(states[t].directions[:, 0], directions[t, :, 0])
+    for t in range(10):
+        torch.testing.assert_close(states[t].directions[:, 1], directions[t, :, 1])
+    found = chain.smoothed(states[:7], None, None)
+    torch.testing.assert_close(found[3].weight[:, 0], states[0].weight[:, 0])  # nothing comes later
+    found = chain.smoothed([states[6]._replace(seen=both), *states[7:]], None, None)
+    later = chain.smoothed(states[5:], None, None)
+    message = found[0].weight[:, 0] / states[6].weight[:, 0]
+    passed = later[0].weight[:, 0] / states[5].weight[:, 0]
+    torch.testing.assert_close(message.pow(4) / message.pow(4).sum(), passed / passed.sum())
+
+
+def test_ellipsoids_grow_while_an_arm_is_not_measured():
+    seen = pixels(body(60), 2.0)
+    seen[30:50] = torch.nan
+    covs = tracker(max_gap=None)(seen[None]).covariance3d[0, :, ROW["hand_left"]]
+    std = covs.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
+    assert float(std[30] - std[29]) > 0.02
+    assert bool((std[30:50].diff() > 0).all()) and float(std[49]) > 0.2
+    assert float(std[55]) < 0.06
+
+
 def test_a_hand_that_is_no_longer_measured_is_expected_where_it_was():
     seen = pixels(body(1), 2.0).expand(50, -1, -1).clone()
     hand = ROW["hand_left"]

@@ -411,11 +411,11 @@ class ArticulatedFilter(Estimator):
         found = apart((arms, middle, shoulders, (middle @ tilt.mT)[:, 0]), len(frames))
         for frame, here, own in zip(frames, states, found, strict=True):
             own_arms, own_middle, own_shoulders, place = own
-            hands = frame.limbs[..., 1]
+            hands, told = frame.limbs[..., 1], _arms_told(frame, facts)
             belief = (
                 self.chain.start(own_arms, hands)
                 if belief is None
-                else self.chain.update(belief, own_arms, hands, again)
+                else self.chain.update(belief, own_arms, hands, again, told)
             )
             seen = _Seen(
                 frame, facts, here.tilt, state.sizes, state.lengths, before, state.moments, roots,
@@ -519,6 +519,7 @@ class ArticulatedFilter(Estimator):
             shoulders=seen.frame.torso[:, :2],
             limbs=seen.frame.limbs,
             whole=seen.facts.whole,
+            lost=(False, False) in seen.facts.patterns,
             exact=seen.frame.exact,
             std=torch.where(seen.frame.known, seen.frame.std, 0.0),
             lengths=seen.sizes.metres,
@@ -551,6 +552,14 @@ class ArticulatedFilter(Estimator):
 def _none_if_nobody(chosen: Tensor) -> Tensor | None:
     """Return the same; None if it is false or 0 for everybody."""
     return chosen if bool(chosen.any()) else None
+
+
+def _arms_told(frame: RayFrame, facts: Facts) -> Bool[Tensor, "B 2"] | None:
+    """Return whether a frame tells anything of each arm; None if it does of both of everybody."""
+    if (False, False) not in facts.patterns:
+        return None
+    measured = frame.limbs.any(-1)
+    return measured if frame.log_inside is None else measured | (frame.log_inside < 0)
 
 
 def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:

@@ -234,7 +234,9 @@ def together(frames: Sequence[Any]) -> Any:
         return torch.stack([*frames], 1).flatten(0, 1)
     if isinstance(first, Facts):
         return first._replace(
-            sided=any(facts.sided for facts in frames), whole=any(facts.whole for facts in frames)
+            patterns=[ends for ends in _ENDS if any(ends in facts.patterns for facts in frames)],
+            sided=any(facts.sided for facts in frames),
+            whole=any(facts.whole for facts in frames),
         )
     if not isinstance(first, tuple):
         return first

@@ -23,6 +23,9 @@ _NOISE = 0.02  # metres: of that, the noise of keypoints
 # full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
 # Other covariances hold as they are, with detectors' errors too.
 _WHOLE, _HAND_ALONE = 0.55, 0.75
+# Metres per second along every axis, of elbows and hands that are not seen, and seconds after which these
+# movements no longer add up.
+_UNSEEN_SPEEDS, _UNSEEN_TIME = (0.45, 0.9), 0.4
 _ROUNDS = 3  # in which bones of given lengths are fitted to elbow and hand
 
 
@@ -32,7 +35,7 @@ class SeenBody(NamedTuple):
     Attributes:
         joints: shoulders, neck and head, metres, [B, 8, 3]; the others are 0.
         shoulders: whether these are measured, [B, 2]. limbs: whether elbow and hand of both arms are,
-            [B, 2, 2]. whole: whether both of any arm are.
+            [B, 2, 2]. whole: whether both of any arm are. lost: whether neither of any arm is.
         exact: whether every keypoint has full confidence, [B].
         std: the standard deviation of a pixel over the focal length, 0 where no joint is measured, [B, 8].
         lengths: the lengths of the bones, metres, [B, 4]. bones: the same as they are reported, with
@@ -48,6 +51,7 @@ class SeenBody(NamedTuple):
     shoulders: Tensor
     limbs: Tensor
     whole: bool
+    lost: bool
     exact: Tensor
     std: Tensor
     lengths: Tensor
@@ -127,7 +131,10 @@ def pose_of(
     trust = _trust(body.shoulders, body.limbs, body.exact).to(joints)
     trust = trust if calibrated else torch.ones_like(trust)
     trust = trust.repeat_interleave(2, 1)[..., None, None]
-    covs, of_limbs = _covs(body, joints, spread.flatten(1, 2), trust)
+    spread = spread.flatten(1, 2)
+    if body.lost:
+        spread = spread + _moved_unseen(belief.missed)
+    covs, of_limbs = _covs(body, joints, spread, trust)
     mean_covs = covs.index_copy(1, rows, of_limbs)
     posterior = joints, mean_covs
     if body.whole:
@@ -144,6 +151,20 @@ def pose_of(
     return FramePose(
         *pose, *seen, body.tilt @ axes.mT, evidence, log_weights, body.bones.metres, body.bones.covs
     )
+
+
+def _moved_unseen(missed: Float[Tensor, "B 2"]) -> Float[Tensor, "B 4 3 3"]:
+    """Return the covariances of how far elbows and hands have moved since their arms were measured.
+
+    People move on, and hypotheses about their arms stand still: the standard deviation along every axis is
+    v t / (1 + t / T).
+
+    Args:
+        missed: t, seconds.
+    """
+    far = missed / (1 + missed / _UNSEEN_TIME)
+    variance = torch.stack([speed * far for speed in _UNSEEN_SPEEDS], -1).square().flatten(1)
+    return variance[..., None, None] * torch.eye(3, dtype=missed.dtype, device=missed.device)
 
 
 def enlarged(pose: FramePose, factor: float) -> FramePose:
