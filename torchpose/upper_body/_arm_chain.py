@@ -37,6 +37,7 @@ _LATER = 0.25
 _RATE = 30.0
 _HELD = 0.22  # seconds for which hypotheses move along where nothing of an arm is measured
 _DRIFT = math.radians(3.0)  # step of these in a frame, at 30 frames a second
+_NEVER = 1e6  # seconds
 _LEAST = 1e-30  # density
 # Pairs of directions for each hypothesis from which on, and share of them at most of which, densities are
 # computed pair by pair.
@@ -112,7 +113,7 @@ class ArmState(NamedTuple):
         prior, predicted: the density of the prior, and that predicted from the frames before, at each
             hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
-        missed: for how many seconds nothing of each arm has been measured, [B, 2].
+        missed: for how many seconds nothing of each arm has been measured, [B, 2]; a million if it never was.
     """
 
     directions: Tensor
@@ -290,14 +291,20 @@ class ArmChain:
         tied = ((left @ self.density.together) * right).sum(-1)
         return arms.log_evidence.sum(1) + tied.log()
 
-    def start(self, arms: Arms, seen: Bool[Tensor, "B 2"]) -> ArmState:
+    def start(
+        self, arms: Arms, seen: Bool[Tensor, "B 2"], told: Bool[Tensor, "B 2"] | None = None
+    ) -> ArmState:
         """Return the posterior after the first frame, given one hypothesis of the root.
 
         Args:
             arms: the hypotheses. seen: whether the hands are measured.
+            told: whether anything is known of each arm in this frame; None is both of everybody.
         """
         prior = arms.log_prior[:, :, 0].exp()
-        return _belief(arms, prior, prior, seen)
+        belief = _belief(arms, prior, prior, seen)
+        if told is None:
+            return belief
+        return belief._replace(missed=torch.where(told, belief.missed, _NEVER))
 
     def update(
         self,
@@ -311,7 +318,7 @@ class ArmChain:
 
         Args:
             again: whose arms start again, as if it were their first frame; None is nobody.
-            told: whether anything is known of each arm in this frame; None is both of everybody.
+            told: as of `start`.
         """
         prior = arms.log_prior[:, :, 0].exp()
         moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0], seen)
@@ -321,12 +328,12 @@ class ArmChain:
         belief = _belief(arms, prior, predicted, seen)
         if told is None:
             return belief
-        missed = (state.missed + self.frame).masked_fill(told, 0.0)
-        belief = belief._replace(missed=missed)
-        held = _is_held(missed)
+        missed = state.missed + self.frame
         if again is not None:
-            held = held & ~again[:, None]
-        return _chosen(held, self._moved_along(state, missed), belief)
+            missed = missed.masked_fill(again[:, None], _NEVER)
+        missed = missed.masked_fill(told, 0.0)
+        moved_along = self._moved_along(state, missed)
+        return _chosen(_is_held(missed), moved_along, belief._replace(missed=missed))
 
     @staticmethod
     def _moved_along(state: ArmState, missed: Float[Tensor, "B 2"]) -> ArmState:

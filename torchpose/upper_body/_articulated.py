@@ -413,7 +413,7 @@ class ArticulatedFilter(Estimator):
             own_arms, own_middle, own_shoulders, place = own
             hands, told = frame.limbs[..., 1], _arms_told(frame, facts)
             belief = (
-                self.chain.start(own_arms, hands)
+                self.chain.start(own_arms, hands, told)
                 if belief is None
                 else self.chain.update(belief, own_arms, hands, again, told)
             )

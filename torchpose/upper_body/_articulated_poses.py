@@ -23,9 +23,9 @@ _NOISE = 0.02  # metres: of that, the noise of keypoints
 # full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
 # Other covariances hold as they are, with detectors' errors too.
 _WHOLE, _HAND_ALONE = 0.55, 0.75
-# Metres per second along every axis, of elbows and hands that are not seen, and seconds after which these
-# movements no longer add up.
-_UNSEEN_SPEEDS, _UNSEEN_TIME = (0.45, 0.9), 0.4
+# Metres per second along every axis, of elbows and hands that are not seen, and seconds after which the
+# hypotheses themselves have spread.
+_UNSEEN_SPEEDS, _UNSEEN_TIME = (0.45, 0.9), 0.7
 _ROUNDS = 3  # in which bones of given lengths are fitted to elbow and hand
 
 
@@ -156,13 +156,13 @@ def pose_of(
 def _moved_unseen(missed: Float[Tensor, "B 2"]) -> Float[Tensor, "B 4 3 3"]:
     """Return the covariances of how far elbows and hands have moved since their arms were measured.
 
-    People move on, and hypotheses about their arms stand still: the standard deviation along every axis is
-    v t / (1 + t / T).
+    People move on, and hypotheses about their arms stand still until they are drawn anew: the standard deviation
+    along every axis is v t / (1 + (t / T)^2).
 
     Args:
         missed: t, seconds.
     """
-    far = missed / (1 + missed / _UNSEEN_TIME)
+    far = missed / (1 + (missed / _UNSEEN_TIME).square())
     variance = torch.stack([speed * far for speed in _UNSEEN_SPEEDS], -1).square().flatten(1)
     return variance[..., None, None] * torch.eye(3, dtype=missed.dtype, device=missed.device)
 
