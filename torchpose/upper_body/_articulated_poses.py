@@ -156,8 +156,8 @@ def pose_of(
 def _moved_unseen(missed: Float[Tensor, "B 2"]) -> Float[Tensor, "B 4 3 3"]:
     """Return the covariances of how far elbows and hands have moved since their arms were measured.
 
-    People move on, and hypotheses about their arms stand still until they are drawn anew: the standard deviation
-    along every axis is v t / (1 + (t / T)^2).
+    People move on, and hypotheses about their arms stand still until they are drawn anew: the standard
+    deviation along every axis is v t / (1 + (t / T)^2).
 
     Args:
         missed: t, seconds.
