@@ -93,6 +93,22 @@ def test_what_pages_include_is_there():
             assert any((base / name).is_file() for base in bases), f"{page}: {name} is missing"
 
 
+def test_parts_of_pages_that_are_included_have_the_heads_of_their_tables():
+    found = 0
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for name, first, last in re.findall(r'^--8<-- "([^":]+):(\d+):(\d+)"', text, re.MULTILINE):
+            lines = (ROOT / "docs" / name).read_text(encoding="utf-8").splitlines()
+            part = ["", *lines[int(first) - 1 : int(last)]]
+            heads = [part[i + 1 : i + 3] for i, line in enumerate(part[:-2]) if not line.strip()]
+            for head, below in (pair for pair in heads if pair[0].startswith("|")):
+                assert re.fullmatch(r"[|:\s-]+", below), (
+                    f"{page}: {name}:{first} begins with {head}"
+                )
+                found += 1
+    assert found > 4
+
+
 def test_readme_shows_a_snippet():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
