@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose._core.facade import set_up_facade
+from torchpose._core.rows import where_rows
 from torchpose.body._kinematics import Body, Frame
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError, SkeletonError
@@ -276,9 +277,9 @@ def _gauss_newton(
         moved = _moved(fit, residual, jacobian, damping)
         new_residual, new_jacobian = linearise(moved)
         better = new_residual.square().sum(-1) < residual.square().sum(-1)
-        fit = _Fit(*(_where(better, new, old) for new, old in zip(moved, fit, strict=True)))
-        residual = _where(better, new_residual, residual)
-        jacobian = _where(better, new_jacobian, jacobian)
+        fit = where_rows(better, moved, fit)
+        residual = where_rows(better, new_residual, residual)
+        jacobian = where_rows(better, new_jacobian, jacobian)
         damping = damping * torch.where(better, 0.1, 100.0).to(damping)
         damping = damping.clamp(_DAMPING, _MOST_DAMPING)
     return fit
@@ -306,11 +307,6 @@ def _linearise(body: Body, fit: _Fit, joints: Tensor, known: Tensor) -> tuple[Te
     still = torch.eye(3).to(moves).expand(*moves.shape[:2], 3, 3)
     jacobian = torch.cat([still, moves], -1)
     return residual[:, known].flatten(1), jacobian[:, known].flatten(1, 2)
-
-
-def _where(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Return `new` or `old` by frame, as `torch.where`."""
-    return torch.where(condition.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _tilt_residual(fit: _Fit, tilt: _Tilt) -> tuple[Tensor, Tensor]:

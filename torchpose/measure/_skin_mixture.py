@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_count, check_shape
+from torchpose._core.rows import where_rows
 from torchpose.errors import InputError
 from torchpose.math._mixture_steps import MixtureParameters, natural_parameters
 from torchpose.measure._face_detector import check_faces
@@ -194,7 +195,7 @@ class SkinMixtureModel(nn.Module):
             averaged = kept * state.statistics + (1 - kept) * now
             renewed = self._mixture(fitted, averaged)
             running = due & ((step < self.steps) | first[:, 0, 0])
-            fitted = _where(running, renewed, fitted)
+            fitted = where_rows(running, renewed, fitted)
         return fitted
 
     def _started(
@@ -211,7 +212,7 @@ class SkinMixtureModel(nn.Module):
         cov = (cov + self.floor * torch.eye(3).to(cov))[:, None].expand_as(state.covariances)
         even = torch.full_like(state.weights, 1 / self.n_components)
         new = state._replace(weights=even, means=means, covariances=cov)
-        return _where(state.frames == 0, new, state)
+        return where_rows(state.frames == 0, new, state)
 
     def _mixture(self, state: SkinMixtureState, statistics: Tensor) -> SkinMixtureState:
         """Return the mixture of the statistics: the maximisation step (BL 54-56)."""
@@ -225,13 +226,6 @@ class SkinMixtureModel(nn.Module):
         covariances = covariances + self.floor * torch.eye(3).to(means)
         weights = count / count.sum(-1, keepdim=True)
         return SkinMixtureState(weights, means, covariances, statistics, state.frames)
-
-
-def _where(rows: Tensor, new: SkinMixtureState, old: SkinMixtureState) -> SkinMixtureState:
-    chosen = (
-        torch.where(rows.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(new, old, strict=True)
-    )
-    return SkinMixtureState(*chosen)
 
 
 def _features(colours: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchpose._core.module_state import outside_inference
+from torchpose._core.rows import where_rows
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._arm_reach import loss_beyond_reach
 from torchpose.upper_body._direction_density import DirectionDensity
@@ -333,7 +334,7 @@ class ArmChain:
             missed = missed.masked_fill(again[:, None], _NEVER)
         missed = missed.masked_fill(told, 0.0)
         moved_along = self._moved_along(state, missed)
-        return _chosen(_is_held(missed), moved_along, belief._replace(missed=missed))
+        return where_rows(_is_held(missed), moved_along, belief._replace(missed=missed))
 
     @staticmethod
     def _moved_along(state: ArmState, missed: Float[Tensor, "B 2"]) -> ArmState:
@@ -515,14 +516,6 @@ def _belief(
 def _is_held(missed: Float[Tensor, "B 2"]) -> Bool[Tensor, "B 2"]:
     """Return of which arms hypotheses move along, by the time for which nothing of them has been measured."""
     return (missed > 0) & (missed < _HELD)
-
-
-def _chosen(arms: Bool[Tensor, "B 2"], new: ArmState, old: ArmState) -> ArmState:
-    """Return the belief over the chosen arms from `new`, and over the others from `old`."""
-    fields = zip(new, old, strict=True)
-    return ArmState(
-        *(torch.where(arms.view(*arms.shape, *[1] * (x.ndim - 2)), x, y) for x, y in fields)
-    )
 
 
 @cache

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived, outside_inference
+from torchpose._core.rows import where_rows
 from torchpose.errors import InputError
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.priors._lifting_network import LiftingNetwork, shipped_lifting_network
@@ -492,7 +493,9 @@ class ArticulatedFilter(Estimator):
     ) -> ArticulatedState:
         """Return the state in which torso and lengths of the chosen bodies are as before any frame."""
         begun = self._before_any_frame(len(chosen))
-        fields = {name: _where(chosen, new, getattr(state, name)) for name, new in begun.items()}
+        fields = {
+            name: where_rows(chosen, new, getattr(state, name)) for name, new in begun.items()
+        }
         return state._replace(**fields)
 
     def _poses(
@@ -560,13 +563,6 @@ def _arms_told(frame: RayFrame, facts: Facts) -> Bool[Tensor, "B 2"] | None:
         return None
     measured = frame.limbs.any(-1)
     return measured if frame.log_inside is None else measured | (frame.log_inside < 0)
-
-
-def _where(chosen: Bool[Tensor, " B"], new: Any, old: Any) -> Any:
-    """Return the values of the chosen from `new`, and the others' from `old`, tensors or tuples of them."""
-    if isinstance(old, Tensor):
-        return torch.where(chosen.view(-1, *[1] * (old.ndim - 1)), new, old)
-    return type(old)(*(_where(chosen, *both) for both in zip(new, old, strict=True)))
 
 
 @cache
