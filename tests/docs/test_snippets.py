@@ -109,6 +109,19 @@ def test_parts_of_pages_that_are_included_have_the_heads_of_their_tables():
     assert found > 4
 
 
+def test_lists_stay_lists_on_the_built_pages():
+    """Markdown's Python package wants four spaces within an item, and merges lists that follow each other."""
+    for page in PAGES:
+        text = re.sub(r"^( *)```.*?^\1```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+        for wrong in (
+            r"\n\n {2,3}[^ \n-][^\n]*",  # after an empty line an item goes on with four
+            r"\n    \S[^\n]*\n- [^\n]*",  # and the next one needs an empty line after that
+            r"\n\d+\. [^\n]*(?:\n +\S[^\n]*)*\n\n- [^\n]*",  # numbers, and then points
+        ):
+            found = re.search(wrong, text)
+            assert found is None, f"{page}: {found and found[0].strip()}"
+
+
 def test_readme_shows_a_snippet():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
