@@ -401,6 +401,32 @@ def test_times_in_place_of_frames_increase(tmp_path, times):
         read_keypoints(text(tmp_path, "timestamp,head_x,head_y", *rows))
 
 
+@pytest.mark.parametrize("times", [(5, 5), (0, 1, 1), ("10:00:01", "10:00:01", "10:00:02")])
+def test_two_rows_of_one_time_are_told_apart_from_wrong_frame_numbers(tmp_path, times):
+    rows = [f"{time},10,20" for time in times]
+    expected = rf"line {2 + times.index(times[1]) + 1}: expected a later time than {times[1]}, which the row"
+    with pytest.raises(FileFormatError, match=f"{expected}.*column 'frame'"):
+        read_keypoints(text(tmp_path, "time,head_x,head_y", *rows))
+
+
+@pytest.mark.parametrize(
+    ("header", "steps", "count", "fps"),
+    [
+        ("time,head_x,head_y", (28, 52), 61, 25.0),
+        ("time,frame,head_x,head_y", (28, 52), 61, 25.0),
+        ("time,head_x,head_y", (33, 67), 91, 30.0),
+    ],
+)
+def test_jitter_of_times_is_no_missing_frame(tmp_path, header, steps, count, fps):
+    """Steps of 28 and 52 ms in turn are frames of 40 ms; of 33 and 67 ms, every third is missing."""
+    times = [0, *np.tile(steps, 30).cumsum().tolist()]
+    numbered = "frame" in header
+    rows = [f"{time},{f'{t},' * numbered}10,20" for t, time in enumerate(times)]
+    read = read_keypoints(text(tmp_path, header, *rows))
+    assert len(read.keypoints) == count
+    assert read.fps == pytest.approx(fps)
+
+
 def test_rows_without_frames_and_times_are_frames(tmp_path):
     read = read_keypoints(text(tmp_path, "head_x,head_y", "1,2", "3,4", "5,6"))
     assert read.keypoints[:, 0, 0].tolist() == [1, 3, 5]

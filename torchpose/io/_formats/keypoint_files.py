@@ -215,8 +215,8 @@ def _with_frames(path: Path, rows: _Rows, times: _Times | None) -> _Rows:
 
     Times that are several usual steps apart have missing frames between them; equal ones are one frame.
     """
-    frames = range(len(rows) - 1) if times is None else _frames_by_times(path, times)
     (number, header), *filled = rows
+    frames = range(len(filled)) if times is None else _frames_by_times(path, header, times)
     numbered = zip(filled, frames, strict=True)
     return [
         (number, ["frame", *header]),
@@ -224,8 +224,8 @@ def _with_frames(path: Path, rows: _Rows, times: _Times | None) -> _Rows:
     ]
 
 
-def _frames_by_times(path: Path, times: _Times) -> Sequence[int]:
-    """Return the number of each row's frame."""
+def _frames_by_times(path: Path, header: Sequence[str], times: _Times) -> Sequence[int]:
+    """Return the number of each row's frame; rows of one time are one where each names its keypoint."""
     steps = np.diff(times.stamps)
     bad = ~(steps >= 0)  # NaN included
     if bad.any():
@@ -233,6 +233,13 @@ def _frames_by_times(path: Path, times: _Times) -> Sequence[int]:
         raise FileFormatError(
             f"{path}, line {number}: expected times that increase, as there is no column of frames, "
             f"got {cell or 'none'}"
+        )
+    if {cell.lower() for cell in header}.isdisjoint(_NAMES) and (steps == 0).any():
+        number, cell = times.cells[1 + int(steps.argmin())]
+        raise FileFormatError(
+            f"{path}, line {number}: expected a later time than {cell}, which the row before has too, as "
+            "each row is a frame and there is no column of frames; number the frames in a column 'frame', "
+            "give finer times, or delete what is there twice"
         )
     usual = usual_step(steps[steps > 0]) if (steps > 0).any() else 1.0
     if (steps > _MAX_GAP * usual).any():
