@@ -236,6 +236,28 @@ def test_states_of_something_else_are_refused(prior, few):
         other.step(tracker.init(len(few), NAMES), few[:, 0])
 
 
+@pytest.mark.parametrize(
+    ("method", "change", "message"),
+    [
+        ("mkf-fixed", {"fps": 15.0}, r"with fps=15.0, got .* with fps=30.0; begin with init"),
+        ("articulated", {"height": 1.9}, "height=1.9, got .* height=None"),
+        ("articulated", {"bone_lengths": {"forearm": 0.2}}, "bone_lengths=.*got .* bone_lengths=None"),
+        ("multiple-model", {"steady": False}, "steady=False, got .* steady=True"),
+        ("mkf-fixed", {"outliers": False}, "outliers=False, got .* outliers=True"),
+        ("pf-walk", {"n_particles": 50}, "n_particles=50, got .* n_particles=None"),
+    ],
+)
+def test_states_of_a_tracker_with_other_options_are_refused(prior, few, method, change, message):
+    tracker = UpperBodyTracker(prior, demo_camera(), method, fps=30.0)
+    other = UpperBodyTracker(prior, demo_camera(), method, **{"fps": 30.0, **change})
+    state, _ = tracker.step(tracker.init(len(few), NAMES), few[:, 0])
+    with pytest.raises(InputError, match=message):
+        other.step(state, few[:, 1])
+    with pytest.raises(InputError, match=message):
+        other.advance(state, few)
+    copy.deepcopy(tracker).step(state, few[:, 1])
+
+
 def test_what_no_step_changes_is_computed_once(prior, few, monkeypatch):
     tracker = UpperBodyTracker(prior, demo_camera(), "articulated", neck="mid-shoulder")
     state, _ = tracker.step(tracker.init(len(few), NAMES), few[:, 0])

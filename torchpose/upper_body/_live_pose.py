@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchpose._core.stream_settings import StreamSettings
 from torchpose.errors import InputError
 from torchpose.upper_body._fusion import MotionStageState
 from torchpose.upper_body._picked import Picked
@@ -22,7 +23,8 @@ class StreamState(NamedTuple):
         unseen: the number of frames since any joint was measured, [B].
         n_keypoints: J. picked: the places of the eight joints among them, and the assumptions.
         screen: state of the outlier screening; None without any.
-        method: the name of the method whose state it is.
+        method: the name of the method whose state it is. settings: of the tracker whose state it is, as far
+            as the numbers depend on them; None if they are not known.
     """
 
     estimator: Any
@@ -32,6 +34,7 @@ class StreamState(NamedTuple):
     picked: Picked
     screen: ScreenState | None = None
     method: str | None = None
+    settings: StreamSettings | None = None
 
 
 class LivePose(NamedTuple):

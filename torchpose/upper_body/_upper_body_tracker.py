@@ -24,6 +24,7 @@ from torchpose._core.module_state import (
     wide_or_parameter,
     working_precision,
 )
+from torchpose._core.stream_settings import StreamSettings, check_settings, settings_of
 from torchpose._core.uncompiled import uncompiled
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._tilt import angles_of_up
@@ -350,7 +351,9 @@ class UpperBodyTracker(WideModule):
             joints, arms = arm_joints(picked.there), generators_of_arms(generator)
             state = reader.estimator.init(batch_size, joints, arms)
         unseen = torch.zeros(batch_size, dtype=torch.long, device=cov.device)
-        return StreamState(state, None, unseen, n_keypoints, picked, method=reader.method)
+        return StreamState(
+            state, None, unseen, n_keypoints, picked, method=reader.method, settings=self._settings
+        )
 
     @uncompiled
     def step(
@@ -378,7 +381,8 @@ class UpperBodyTracker(WideModule):
             The next state, and the `LivePose` of this frame.
 
         Raises:
-            ShapeError, InputError: wrong shapes, infinite values, or a state of another method.
+            ShapeError, InputError: wrong shapes, infinite values, or a state of another method, or of a tracker
+            of another frame rate, prior or option.
         """
         check_stream(state)
         given = {"confidence": confidence, "mask": mask, "covariance": covariance, "absent": absent}
@@ -415,7 +419,7 @@ class UpperBodyTracker(WideModule):
 
         Raises:
             ShapeError, InputError: wrong shapes, no frames, infinite values, or a state of another
-            method.
+            method, or of a tracker of another frame rate, prior or option.
         """
         refuse_export(*_NO_EXPORT)
         check_stream(state)
@@ -433,12 +437,19 @@ class UpperBodyTracker(WideModule):
             )
             reader = self._reader(state.picked.there, state.picked, cov)
             check_stream_method(state, reader.method)
+            check_settings(state.settings, self._settings)
             screen, found = screen_joints(self._screen(state.picked, cov), state.screen, given)
             own, estimates = reader.estimator.advance(state.estimator, found.measured)
             motion, track = reader.read(state.motion, estimates, found)
         unseen = unseen_frames(state.unseen, found.measured.mask.any(-1))
         state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
         return state, track.in_precision(self.dtype)
+
+    @property
+    def _settings(self) -> StreamSettings:
+        """Return the settings on which the meaning of a stream's state depends."""
+        own = {"fps": self.fps, "steady": not self._unsteady, "outliers": self.outliers}
+        return settings_of({"prior": self.prior.info.name, **own, "neck": self.neck, **self.options})
 
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
         """Return the notes about the choice of the method and about the kinds of neck and hands."""

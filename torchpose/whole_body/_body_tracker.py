@@ -13,6 +13,7 @@ from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import OwnPrecisionModule, as_one_run
 from torchpose._core.moved import warn_of_former
+from torchpose._core.stream_settings import StreamSettings, check_settings, settings_of
 from torchpose._core.uncompiled import uncompiled
 from torchpose.body._kinematics import Body
 from torchpose.camera._choice import check_room
@@ -51,12 +52,15 @@ class BodyStream(NamedTuple):
     Attributes:
         filter: state of the filter; None before the first keypoints. frame: number of the next frame.
         generator: of random numbers. names: of the keypoints of every frame that states none.
+        settings: of the tracker whose state it is, as far as the numbers depend on them; None if they are not
+            known.
     """
 
     filter: BodyFilterState | LiveBody | LivePeople | None
     frame: int
     generator: torch.Generator | None
     names: tuple[str, ...] | None = None
+    settings: StreamSettings | None = None
 
 
 class BodyTracker(OwnPrecisionModule):
@@ -166,11 +170,16 @@ class BodyTracker(OwnPrecisionModule):
         check_room(rig)
         self.fps = float(fps)
         self.notes: tuple[str, ...] = ()
+        settings = settings_of({
+            "fps": self.fps, "cameras": len(rig), "body": body, "height": height, "motion": motion, "up": up,
+            "n_particles": n_particles, "camera_height": camera_height, **given, **options,
+        })  # fmt: skip
         self.by_keypoints: KeypointBodyTracker | None = None
         if method == KEYPOINT_METHOD:
             noise = {"process_cov": process_cov, "initial_cov": initial_cov}
             refuse([*given, *options, *given_of(noise)], f"for method {method}")
             self.method = method
+            self._settings = (("method", method), *settings)
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.cameras, self.n_particles = rig, 0
             self.by_keypoints = KeypointBodyTracker(
@@ -182,6 +191,7 @@ class BodyTracker(OwnPrecisionModule):
         of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
         refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
         self.method = choose_method(method, given)
+        self._settings = (("method", self.method), *settings)
         self._by_particles = set_up_particles(
             self.method, rig, given, body, height, self.fps, n_particles,
             {**options, **given_of({"process_cov": process_cov})}, (keypoint_std, pixel_std),
@@ -354,7 +364,7 @@ class BodyTracker(OwnPrecisionModule):
                 "facing": facing,
             }  # fmt: skip
             refuse(given_of(others), f"for method {self.method}")
-            return BodyStream(None, 0, None, _names(names))
+            return BodyStream(None, 0, None, _names(names), self._settings)
         check_facing(facing, initial_state, keypoints)
         if initial_state is None:
             if silhouettes is None and keypoints is None:
@@ -365,7 +375,7 @@ class BodyTracker(OwnPrecisionModule):
             frames = list(self._by_particles.observed(silhouettes, given)[0])
             initial_state = self._by_particles.first_state(frames, generator, facing)
         first = self._by_particles.begin(initial_state, self.initial_cov, generator)
-        return BodyStream(first, 0, generator, _names(names))
+        return BodyStream(first, 0, generator, _names(names), self._settings)
 
     @overload
     def step(
@@ -421,7 +431,7 @@ class BodyTracker(OwnPrecisionModule):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
-        names = _stream_names(state, names)
+        names = self._stream_names(state, names)
         if self.by_keypoints is None:
             check_filters_one(self.method, "none", "none", persons)
             given = given_keypoints(keypoints, confidence, names, covariance)
@@ -470,7 +480,7 @@ class BodyTracker(OwnPrecisionModule):
             ShapeError, InputError, CameraError: as `forward`. InputError: a stream of "kalman", which takes
             one frame at a time, by `step`.
         """
-        names = _stream_names(state, names)
+        names = self._stream_names(state, names)
         if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
@@ -497,6 +507,22 @@ class BodyTracker(OwnPrecisionModule):
             )
         return find_camera_tilt(tracks, self.cameras)
 
+    def _stream_names(
+        self, state: BodyStream, names: Sequence[str] | None
+    ) -> Sequence[str] | None:
+        """Return the names of a frame's keypoints: those given with it, else those given at first.
+
+        Raises:
+            InputError: what is no state of this tracker.
+        """
+        if not isinstance(state, BodyStream):
+            raise InputError(
+                f"state must be a BodyStream, got {type(state).__name__}; begin with init, and pass on what "
+                "the step before returned"
+            )
+        check_settings(state.settings, self._settings)
+        return state.names if names is None else names
+
     def _tracked(
         self, state: BodyStream, frames: Iterable[Observed]
     ) -> tuple[BodyStream, BodyTrack]:
@@ -512,20 +538,6 @@ class BodyTracker(OwnPrecisionModule):
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:
     return None if names is None else tuple(names)
-
-
-def _stream_names(state: BodyStream, names: Sequence[str] | None) -> Sequence[str] | None:
-    """Return the names of a frame's keypoints: those given with it, else those given at first.
-
-    Raises:
-        InputError: what is no state.
-    """
-    if not isinstance(state, BodyStream):
-        raise InputError(
-            f"state must be a BodyStream, got {type(state).__name__}; begin with init, and pass on what the "
-            "step before returned"
-        )
-    return state.names if names is None else names
 
 
 set_up_facade(__name__)

@@ -945,6 +945,22 @@ def test_a_height_in_centimetres_and_no_state_are_refused(four):
         tracker(four.rig).step(None, keypoints=four.keypoints[0])
 
 
+def test_states_of_a_tracker_with_other_options_are_refused(four):
+    mine = tracker(four.rig)
+    state, _ = mine.step(mine.init(), keypoints=four.keypoints[0])
+    others = {
+        f"fps=15.0, got that of a tracker with fps={FPS:g}": BodyTracker(four.rig, "kalman", fps=15),
+        "cameras=2, got that of a tracker with cameras=4": tracker(four.rig.select([0, 1])),
+        "height=1.9, got that of a tracker with height=None": tracker(four.rig, height=1.9),
+        "with method='sir', .*got .* method='kalman'": BodyTracker(four.rig, "sir", fps=FPS),
+    }
+    for message, other in others.items():
+        seen = four.keypoints[1][: len(other.cameras)]
+        with pytest.raises(InputError, match=f"{message}.*begin with init of this tracker"):
+            other.step(state, keypoints=seen)
+    tracker(four.rig).step(state, keypoints=four.keypoints[1])
+
+
 def test_a_keypoint_that_is_of_no_ray_is_missing():
     camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=(-0.35,))
     keypoints = torch.full((1, 1, 15, 2), 600.0).double()
