@@ -395,6 +395,11 @@ BAD_INPUT = {
         [CLIP, "--method", "mkf-fixed", "--bone-lengths", "forearm=0.2"],
         "it is of articulated",
     ),
+    "a length twice": ([CLIP, "--bone-lengths", "forearm=0.2,forearm=0.3"], "each length once"),
+    "a height beside lengths": (
+        [CLIP, "--height", "1.6", "--bone-lengths", "forearm=0.2"],
+        "bone_lengths and height each tell how large",
+    ),
     "a height in feet": ([CLIP, "--height", "5.7"], "it is in metres"),
     "nobody's poses": ([CLIP, "--person", "{tmp}/none.npz"], "no such file"),
     "negative std": ([CLIP, "--measurement-std=-2"], "must be positive"),

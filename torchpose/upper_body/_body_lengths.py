@@ -103,7 +103,8 @@ class BodyLengths:
         unit: how many times as large the subject is known to be as the prior's persons.
 
     Raises:
-        InputError: an unknown name, a length or a height that nobody has, or poses without lengths.
+        InputError: an unknown name, a length or a height that nobody has, poses without lengths, or several
+            facts, each of which tells the size.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class BodyLengths:
         self.usual = prior.lengths[rows].to(like) + self.lower
         self.spread = prior.spread[rows].to(like)
         self.unit = 1.0
+        _check_one_size(known)
         if known.height is not None:
             self._grow(known.height)
         if known.person is not None:
@@ -294,3 +296,14 @@ class BodyLengths:
             slope = both * expected * (seen - expected) / variance
             found.append((slope, both * expected.square() / variance))
         return found[0], found[1]
+
+
+def _check_one_size(known: KnownBody) -> None:
+    """Raise `InputError` where several facts tell the size of the subject."""
+    facts = {"person": known.person, "bone_lengths": known.lengths, "height": known.height}
+    given = [name for name, value in facts.items() if value is not None]
+    if len(given) > 1:
+        raise InputError(
+            f"{' and '.join(given)} each tell how large the person is, got {len(given)} of them; leave all but "
+            "one out"
+        )

@@ -54,7 +54,7 @@ class TrackSettings:
             Kinect's neck, which is 10.5 cm above the middle of the shoulders).
         height: articulated: the height of the person in metres, if their bones were not measured.
         person: articulated: the .npz of an earlier recording of the same person, whose bone lengths are
-            taken.
+            taken; without height and bone_lengths.
         frame: the axes of the 3D poses: those of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
         window: deprecated: false stands for the method mkf-fixed, true for window-mixture if the prior
@@ -143,13 +143,16 @@ def _lengths_of(text: str) -> dict[str, float]:
         InputError: anything else.
     """
     try:
-        pairs = (part.split("=") for part in text.split(","))
-        return {name.strip(): float(metres) for name, metres in pairs}
+        pairs = [part.split("=") for part in text.split(",")]
+        lengths = {name.strip(): float(metres) for name, metres in pairs}
     except ValueError as error:
         raise InputError(
             f"bone_lengths must be NAME=METRES with commas, such as upper_arm=0.28,forearm=0.25, got "
             f"{text!r}"
         ) from error
+    if len(lengths) < len(pairs):
+        raise InputError(f"bone_lengths must name each length once, got {text!r}")
+    return lengths
 
 
 class PreparedTracker(NamedTuple):

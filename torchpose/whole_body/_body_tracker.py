@@ -87,8 +87,8 @@ class BodyTracker(OwnPrecisionModule):
         cameras: a `CameraRig`, or what makes one; silhouettes are undistorted, keypoints are as detected.
         method: "kalman", or a name of `torchpose.whole_body.METHODS`; by default that of the model given,
             else "apf".
-        body: the person's body, or a body.npz (`BodyTrack`) whose bone lengths and shape the person has;
-            then the height is not used.
+        body: the person's body, or a body.npz (`BodyTrack`) whose bone lengths and shape the person has,
+            in place of a height.
         height: the height of the person, metres; by default 1.75 with silhouettes, and estimated from
             keypoints.
         manifold: the poses of an action, by a name that `torchpose info` lists, or a file; in Python also
@@ -120,7 +120,8 @@ class BodyTracker(OwnPrecisionModule):
         upright: the body with which the first pose is found.
 
     Raises:
-        InputError: an unknown method, a model or an option that it does not use, too few particles.
+        InputError: an unknown method, a model or an option that it does not use, both a body and a height, too
+            few particles.
         PriorError: no such model, or one of another skeleton or frame rate.
         CameraError: no cameras, two with the same pose, or some farther away than any room is large.
 
@@ -165,6 +166,8 @@ class BodyTracker(OwnPrecisionModule):
     ) -> None:
         super().__init__()
         check_rate("fps", fps)
+        if body is not None and height is not None:
+            raise InputError("height does nothing beside body, whose bones tell it; leave one of them out")
         given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
         rig = as_rig(cameras)
         check_room(rig)

@@ -945,6 +945,13 @@ def test_a_height_in_centimetres_and_no_state_are_refused(four):
         tracker(four.rig).step(None, keypoints=four.keypoints[0])
 
 
+@pytest.mark.parametrize("method", ["kalman", "sir"])
+def test_a_height_beside_a_body_is_refused(four, method):
+    body = Body.of_height(BODY_15, 1.9)
+    with pytest.raises(InputError, match="height does nothing beside body"):
+        BodyTracker(four.rig, method, body=body, height=1.6)
+
+
 def test_states_of_a_tracker_with_other_options_are_refused(four):
     mine = tracker(four.rig)
     state, _ = mine.step(mine.init(), keypoints=four.keypoints[0])
