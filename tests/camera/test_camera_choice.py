@@ -1,10 +1,12 @@
 """Cameras for images of another size than the calibration's."""
 
+import re
+
 import pytest
 import torch
 
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.camera._choice import fit_to_size, is_padded, resolve_camera
+from torchpose.camera._choice import fit_to_size, held_camera, is_padded, resolve_camera
 from torchpose.errors import CameraError, InputError
 
 CAMERA = PinholeCamera(800, 810, 310, 250, 640, 480, "front", distortions=(0.1, -0.02),
@@ -71,3 +73,28 @@ def test_a_camera_of_one_person_fits_the_images_too(tmp_path):
 def test_a_name_without_a_file_of_cameras_is_refused(given):
     with pytest.raises(InputError, match="--camera-name chooses"):
         resolve_camera(given, "left", (640, 480), None, "clip.mp4")
+
+
+@pytest.mark.parametrize(("tilt", "roll"), [(None, 200.0), (-95.0, None), (0.0, -181.0)])
+def test_angles_of_no_camera_are_named_in_degrees(tilt, roll):
+    message = f"--tilt .*-90 and 90 degrees.*got {tilt or 0:g} and {roll or 0:g}"
+    with pytest.raises(CameraError, match=message):
+        held_camera(CAMERA, tilt, roll, None, None)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ("525,525,5000,239.5", r"\(5000, 239\.5\), lies outside of its images of 640 x 480 pixels"),
+        ("525,319.5,525,239.5", "focal lengths 525 and 319.5 are far apart"),
+        ("525,525,319.5,239.5", None),
+        ("700,525,319.5,239.5", None),
+    ],
+)
+def test_numbers_of_hardly_any_camera_are_noted(numbers, said):
+    _, notes = resolve_camera(numbers, None, (640, 480), None, "clip.npz")
+    fx, fy, cx, cy = map(float, numbers.split(","))
+    matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    _, of_input = resolve_camera(None, None, (640, 480), matrix, "clip.npz")
+    for found in (notes, of_input):
+        assert found == () if said is None else re.search(said, " ".join(found))

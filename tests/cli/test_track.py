@@ -171,6 +171,10 @@ def test_options_reach_the_tracker(track, files):
         expected(files, smoothing="full", frame="body", measurement_std=stds),
     )
     same(track("--smoothing", 3)[1], expected(files, smoothing=3))
+    for none in (0, "none"):
+        done, poses = track("--prior", SMALL, "--smoothing", none)
+        assert "method   multiple-model, filtered" in done.out
+        same(poses, expected(files, prior=load_prior(SMALL)))
     windows = load_prior(SMALL)  # others have nothing that is steady
     same(
         track("--prior", SMALL, "--steady", "false")[1],

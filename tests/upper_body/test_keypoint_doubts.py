@@ -82,6 +82,16 @@ def test_coordinates_in_the_other_order():
     assert "v was given before u" in notes(keypoints(keypoints=keypoints().keypoints.flip(-1)))
 
 
+def test_a_head_and_a_neck_tell_it_where_no_trunk_is_seen():
+    """Of head, neck and hands, which the prior takes, the hands may be anywhere."""
+    names = ("head", "neck", "left_hand", "right_hand")
+    seen = torch.tensor([[320, 80], [320, 120], [380, 40], [280, 330]]).double().repeat(5, 1, 1)
+    upwards = torch.stack([seen[..., 0], 480 - seen[..., 1]], -1)
+    assert notes(keypoints(keypoints=seen, names=names)) == ""
+    assert "the head lies below the neck" in notes(keypoints(keypoints=upwards, names=names))
+    assert "the head lies beside the neck" in notes(keypoints(keypoints=seen.flip(-1), names=names))
+
+
 def test_sides_from_behind_beside_a_face():
     exchanged = [
         name.replace("left", "#").replace("right", "left").replace("#", "right") for name in NAMES

@@ -17,6 +17,8 @@ from torchpose.camera._projection import intrinsics, scale_matrix
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError
 
+_MOST_TILT, _MOST_ROLL = 90, 180  # degrees
+_MOST_STRETCHED = 1.5  # of focal lengths; pixels of HDV are 1.33 times as wide as high
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _LEAST_FOCAL = 10.0  # pixels
 _FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
@@ -60,9 +62,10 @@ def resolve_camera(
             notes += (
                 "the camera's distortions are not applied: undistort keypoints or images beforehand",
             )
-        return camera, notes
+        return camera, (*notes, *_doubts_about(camera))
     if matrix is not None:
-        return _of_pixels(PinholeCamera.from_matrix(matrix, *(size or (None, None))), source), ()
+        camera = _of_pixels(PinholeCamera.from_matrix(matrix, *(size or (None, None))), source)
+        return camera, _doubts_about(camera)
     if size is not None:
         camera = PinholeCamera.from_image_size(*size)
         focal = float(camera.matrix[0, 0])
@@ -93,7 +96,7 @@ def held_camera(
 
     Raises:
         InputError: angles and an axis, or an axis without a file of cameras.
-        CameraError: it looks up or down by more than 60 degrees.
+        CameraError: it looks up or down by more than 60 degrees, or angles of no camera.
     """
     if up is not None:
         if tilt is not None or roll is not None:
@@ -106,6 +109,11 @@ def held_camera(
         return camera.with_world_up(up)
     if tilt is None and roll is None:
         return camera
+    if abs(roll or 0.0) > _MOST_ROLL or abs(tilt or 0.0) > _MOST_TILT:
+        raise CameraError(
+            f"--tilt must lie between -{_MOST_TILT} and {_MOST_TILT} degrees and --roll between -{_MOST_ROLL} "
+            f"and {_MOST_ROLL}, got {tilt or 0:g} and {roll or 0:g}"
+        )
     return camera.tilted(math.radians(tilt or 0.0), math.radians(roll or 0.0))
 
 
@@ -134,6 +142,22 @@ def _of_pixels(camera: PinholeCamera, source: object) -> PinholeCamera:
             "640 x 480 is about 525"
         )
     return camera
+
+
+def _doubts_about(camera: PinholeCamera) -> tuple[str, ...]:
+    """Return notes on numbers that hardly any camera has, as those in another order than fx, fy, cx, cy."""
+    fx, fy, _, cx, cy = map(float, intrinsics(camera.matrix))
+    notes = []
+    if not 1 / _MOST_STRETCHED <= fx / fy <= _MOST_STRETCHED:
+        notes.append(f"the camera's focal lengths {fx:g} and {fy:g} are far apart: check its numbers")
+    if camera.image_size is not None and not all(
+        0 <= place <= side for place, side in zip((cx, cy), camera.image_size, strict=True)
+    ):
+        notes.append(
+            f"the optical axis of the camera, ({cx:g}, {cy:g}), lies outside of its images of "
+            f"{_text(camera.image_size)}: unless they are cut from larger ones, check its numbers"
+        )
+    return tuple(notes)
 
 
 def _text(size: tuple[int, int]) -> str:

@@ -208,7 +208,7 @@ def parse_stds(value: Any) -> float | list[float] | None:
 
 
 def parse_smoothing(value: Any) -> int | str | None:
-    """Return a number of frames, "full", or None for "none", as `track-body` has it.
+    """Return a number of frames, "full", or None for "none", as `track-body` has it, and for 0.
 
     Raises:
         ArgumentError: anything else.
@@ -225,4 +225,4 @@ def parse_smoothing(value: Any) -> int | str | None:
         raise ArgumentError(
             None, f"--smoothing must be a number of frames, 'full' or 'none', got {str(value)!r}"
         )
-    return lag
+    return lag or None

@@ -13,6 +13,7 @@ from torchpose.skeleton._joint_sets import canonical_names
 
 _UPPER = ("head", "nose", "neck")
 _LOWER = ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right", "hip_left", "hip_right")
+_HEAD, _NECK = ("head",), ("neck",)
 _LEAST_CONFIDENCE = 0.3  # confidence below which a keypoint is left out
 _MOST = 0.8  # share of the frames in which a doubt has to hold
 _ALONG = 0.7  # cosine of the largest angle between the way from trunk to head and a direction
@@ -60,16 +61,20 @@ def doubts_about(keypoints: Keypoints, neck_is_told: bool, up: Tensor | None) ->
     if keypoints.first_frame:
         yield f"frame 0 is number {keypoints.first_frame} of the file"
     joints = _Joints(keypoints)
-    rise, aside = _directions(joints, up)
+    upper, lower = _ends(joints)
+    rise, aside = _directions(joints.mean(upper) - joints.mean(lower), up)
+    alone = lower == _NECK
     if _mostly(rise, -_ALONG):
+        said = "the head lies below the neck" if alone else "head and neck lie below shoulders and elbows"
         yield (
-            "head and neck lie below shoulders and elbows in most frames: rows of pixels count downwards, so "
-            "keypoints that count upwards have to be turned over"
+            f"{said} in most frames: rows of pixels count downwards, so keypoints that count upwards have to "
+            "be turned over"
         )
     if _mostly(-aside.abs(), -_ALONG):
+        said = "the head lies beside the neck" if alone else "head and neck lie beside shoulders and hips"
         yield (
-            "head and neck lie beside shoulders and hips in most frames: unless the person lies, v was given "
-            "before u, or the video lies on its side (--roll 90 or -90)"
+            f"{said} in most frames: unless the person lies, v was given before u, or the video lies on its "
+            "side (--roll 90 or -90)"
         )
     if _mostly(_facing(joints, up), 0.0):
         yield (
@@ -114,11 +119,17 @@ class _Joints:
         return torch.stack([self(name) for name in names]).nanmean(0)
 
 
+def _ends(joints: _Joints) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the joints of the head and of the trunk, or head and neck where nothing of a trunk is seen."""
+    if bool(joints.mean(_LOWER).isfinite().any()):
+        return _UPPER, _LOWER
+    return _HEAD, _NECK
+
+
 def _directions(
-    joints: _Joints, up: Tensor | None
+    way: Float[Tensor, "T 2"], up: Tensor | None
 ) -> tuple[Float[Tensor, " T"], Float[Tensor, " T"]]:
-    """Return how much of the way from the trunk to the head is up, and how much aside, -1 to 1."""
-    way = joints.mean(_UPPER) - joints.mean(_LOWER)
+    """Return how much of the way from trunk to head is up, and how much aside, -1 to 1."""
     rise, aside = (way @ axis for axis in _axes(up, way))
     length = torch.linalg.vector_norm(way, dim=-1)
     return rise / length, aside / length

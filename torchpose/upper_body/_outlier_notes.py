@@ -9,7 +9,7 @@ from torch import Tensor, arange
 from torchpose._core.wording import counted
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-_TAKEN, _EXCHANGED = "taken as outliers, as if missing", "left and right exchanged back in"
+_TAKEN, _EXCHANGED = "as if missing", "left and right exchanged back in"
 
 
 def outlier_notes(
@@ -35,7 +35,8 @@ def outlier_notes(
     frames = int(exchanged.sum()) if isinstance(exchanged, Tensor) else exchanged
     if any(counts):
         joints = [f"{name} {n}" for name, n in zip(UPPER_BODY, counts, strict=True) if n]
-        said.append(f"{counted(sum(counts), 'keypoint')} {_TAKEN}: {', '.join(joints)}")
+        taken = counted(sum(counts), "keypoint taken as an outlier", "keypoints taken as outliers")
+        said.append(f"{taken}, {_TAKEN}: {', '.join(joints)}")
     if frames:
         said.append(f"{_EXCHANGED} {counted(frames, 'frame')}")
     return ("; ".join(said),) if said else ()

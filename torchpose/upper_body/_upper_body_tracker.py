@@ -121,7 +121,7 @@ class UpperBodyTracker(WideModule):
             the torso shakes more than that, it is enlarged, unless `outliers` is False.
         fps: the frame rate of the keypoints, by which the process noise is scaled; by default that of
             the prior.
-        smoothing: the number of later frames that an estimate may use, "full" for all of them, None for
+        smoothing: the number of later frames that an estimate may use, "full" for all of them, None or 0 for
             none; only for "multiple-model", "articulated", "window-mixture" and "mkf-fixed". Windows then
             look a few frames ahead.
         frame: the axes of the 3D poses: "camera", or "body" for those of the prior's recordings.
@@ -184,6 +184,8 @@ class UpperBodyTracker(WideModule):
             method, steady = options_of_window(method, window, steady)
         self.prior = prior
         self.fps = fps or prior.info.fps
+        if smoothing == 0 and not isinstance(smoothing, bool):
+            smoothing = None
         of_windows = steady is not None or window is not None
         self._chosen = choose_method(prior, method, smoothing, self.fps, options, of_windows)
         self.method, self.notes = self._chosen.method, self._chosen.notes
