@@ -513,7 +513,11 @@ def test_a_height_narrows_lengths_and_must_be_that_of_somebody():
 def test_the_size_of_a_person_is_told_once():
     person = tracker()(pixels(body(3))[None])
     facts = {"person": person, "bone_lengths": {"upper_arm": 0.31}, "height": 1.9}
-    for one, other in (("person", "height"), ("bone_lengths", "height"), ("person", "bone_lengths")):
+    for one, other in (
+        ("person", "height"),
+        ("bone_lengths", "height"),
+        ("person", "bone_lengths"),
+    ):
         with pytest.raises(InputError, match=f"{one} and {other} each tell how large"):
             tracker(**{one: facts[one], other: facts[other]})
 

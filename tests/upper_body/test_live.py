@@ -241,7 +241,11 @@ def test_states_of_something_else_are_refused(prior, few):
     [
         ("mkf-fixed", {"fps": 15.0}, r"with fps=15.0, got .* with fps=30.0; begin with init"),
         ("articulated", {"height": 1.9}, "height=1.9, got .* height=None"),
-        ("articulated", {"bone_lengths": {"forearm": 0.2}}, "bone_lengths=.*got .* bone_lengths=None"),
+        (
+            "articulated",
+            {"bone_lengths": {"forearm": 0.2}},
+            "bone_lengths=.*got .* bone_lengths=None",
+        ),
         ("multiple-model", {"steady": False}, "steady=False, got .* steady=True"),
         ("mkf-fixed", {"outliers": False}, "outliers=False, got .* outliers=True"),
         ("pf-walk", {"n_particles": 50}, "n_particles=50, got .* n_particles=None"),

@@ -111,8 +111,8 @@ def held_camera(
         return camera
     if abs(roll or 0.0) > _MOST_ROLL or abs(tilt or 0.0) > _MOST_TILT:
         raise CameraError(
-            f"--tilt must lie between -{_MOST_TILT} and {_MOST_TILT} degrees and --roll between -{_MOST_ROLL} "
-            f"and {_MOST_ROLL}, got {tilt or 0:g} and {roll or 0:g}"
+            f"--tilt must lie between -{_MOST_TILT} and {_MOST_TILT} degrees and --roll between "
+            f"-{_MOST_ROLL} and {_MOST_ROLL}, got {tilt or 0:g} and {roll or 0:g}"
         )
     return camera.tilted(math.radians(tilt or 0.0), math.radians(roll or 0.0))
 
@@ -149,7 +149,9 @@ def _doubts_about(camera: PinholeCamera) -> tuple[str, ...]:
     fx, fy, _, cx, cy = map(float, intrinsics(camera.matrix))
     notes = []
     if not 1 / _MOST_STRETCHED <= fx / fy <= _MOST_STRETCHED:
-        notes.append(f"the camera's focal lengths {fx:g} and {fy:g} are far apart: check its numbers")
+        notes.append(
+            f"the camera's focal lengths {fx:g} and {fy:g} are far apart: check its numbers"
+        )
     if camera.image_size is not None and not all(
         0 <= place <= side for place, side in zip((cx, cy), camera.image_size, strict=True)
     ):

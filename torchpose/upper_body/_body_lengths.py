@@ -304,6 +304,6 @@ def _check_one_size(known: KnownBody) -> None:
     given = [name for name, value in facts.items() if value is not None]
     if len(given) > 1:
         raise InputError(
-            f"{' and '.join(given)} each tell how large the person is, got {len(given)} of them; leave all but "
-            "one out"
+            f"{' and '.join(given)} each tell how large the person is, got {len(given)} of them; leave all "
+            "but one out"
         )

@@ -65,13 +65,21 @@ def doubts_about(keypoints: Keypoints, neck_is_told: bool, up: Tensor | None) ->
     rise, aside = _directions(joints.mean(upper) - joints.mean(lower), up)
     alone = lower == _NECK
     if _mostly(rise, -_ALONG):
-        said = "the head lies below the neck" if alone else "head and neck lie below shoulders and elbows"
+        said = (
+            "the head lies below the neck"
+            if alone
+            else "head and neck lie below shoulders and elbows"
+        )
         yield (
             f"{said} in most frames: rows of pixels count downwards, so keypoints that count upwards have to "
             "be turned over"
         )
     if _mostly(-aside.abs(), -_ALONG):
-        said = "the head lies beside the neck" if alone else "head and neck lie beside shoulders and hips"
+        said = (
+            "the head lies beside the neck"
+            if alone
+            else "head and neck lie beside shoulders and hips"
+        )
         yield (
             f"{said} in most frames: unless the person lies, v was given before u, or the video lies on its "
             "side (--roll 90 or -90)"

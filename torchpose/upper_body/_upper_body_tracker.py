@@ -383,8 +383,8 @@ class UpperBodyTracker(WideModule):
             The next state, and the `LivePose` of this frame.
 
         Raises:
-            ShapeError, InputError: wrong shapes, infinite values, or a state of another method, or of a tracker
-            of another frame rate, prior or option.
+            ShapeError, InputError: wrong shapes, infinite values, or a state of another method, or of a
+            tracker of another frame rate, prior or option.
         """
         check_stream(state)
         given = {"confidence": confidence, "mask": mask, "covariance": covariance, "absent": absent}
@@ -451,7 +451,9 @@ class UpperBodyTracker(WideModule):
     def _settings(self) -> StreamSettings:
         """Return the settings on which the meaning of a stream's state depends."""
         own = {"fps": self.fps, "steady": not self._unsteady, "outliers": self.outliers}
-        return settings_of({"prior": self.prior.info.name, **own, "neck": self.neck, **self.options})
+        return settings_of(
+            {"prior": self.prior.info.name, **own, "neck": self.neck, **self.options}
+        )
 
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
         """Return the notes about the choice of the method and about the kinds of neck and hands."""

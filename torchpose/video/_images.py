@@ -45,8 +45,8 @@ def find_images(folder: str | Path) -> list[Path]:
     if not images:
         raise InputError(
             f"{folder}: expected a folder of images (png, jpg, bmp, tif, webp), found none among "
-            f"its {len(files)} files; for a video in it, give the video's own name, and for keypoints a folder "
-            "of OpenPose's *_keypoints.json"
+            f"its {len(files)} files; for a video in it, give the video's own name, and for keypoints a "
+            "folder of OpenPose's *_keypoints.json"
         )
     return sorted(images, key=lambda path: (natural_key(path.name), path.name))
 

@@ -120,8 +120,8 @@ class BodyTracker(OwnPrecisionModule):
         upright: the body with which the first pose is found.
 
     Raises:
-        InputError: an unknown method, a model or an option that it does not use, both a body and a height, too
-            few particles.
+        InputError: an unknown method, a model or an option that it does not use, both a body and a height,
+            too few particles.
         PriorError: no such model, or one of another skeleton or frame rate.
         CameraError: no cameras, two with the same pose, or some farther away than any room is large.
 
@@ -167,7 +167,9 @@ class BodyTracker(OwnPrecisionModule):
         super().__init__()
         check_rate("fps", fps)
         if body is not None and height is not None:
-            raise InputError("height does nothing beside body, whose bones tell it; leave one of them out")
+            raise InputError(
+                "height does nothing beside body, whose bones tell it; leave one of them out"
+            )
         given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
         rig = as_rig(cameras)
         check_room(rig)
@@ -510,9 +512,7 @@ class BodyTracker(OwnPrecisionModule):
             )
         return find_camera_tilt(tracks, self.cameras)
 
-    def _stream_names(
-        self, state: BodyStream, names: Sequence[str] | None
-    ) -> Sequence[str] | None:
+    def _stream_names(self, state: BodyStream, names: Sequence[str] | None) -> Sequence[str] | None:
         """Return the names of a frame's keypoints: those given with it, else those given at first.
 
         Raises:

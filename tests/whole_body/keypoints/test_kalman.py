@@ -956,7 +956,9 @@ def test_states_of_a_tracker_with_other_options_are_refused(four):
     mine = tracker(four.rig)
     state, _ = mine.step(mine.init(), keypoints=four.keypoints[0])
     others = {
-        f"fps=15.0, got that of a tracker with fps={FPS:g}": BodyTracker(four.rig, "kalman", fps=15),
+        f"fps=15.0, got that of a tracker with fps={FPS:g}": BodyTracker(
+            four.rig, "kalman", fps=15
+        ),
         "cameras=2, got that of a tracker with cameras=4": tracker(four.rig.select([0, 1])),
         "height=1.9, got that of a tracker with height=None": tracker(four.rig, height=1.9),
         "with method='sir', .*got .* method='kalman'": BodyTracker(four.rig, "sir", fps=FPS),
