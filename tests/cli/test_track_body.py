@@ -220,6 +220,7 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
         (["--height", "182"], "--height must lie between 0.5 and 2.6 m"),
         (["--camera-names", "[front,left]"], "a camera for each of the 3 inputs"),
         (["--facing", "[1,0]"], "three numbers"),
+        (["--facing", "left"], "--facing must be three numbers, such as 1,0,0, got 'left'"),
         (["--facing", "[1,0,0]", "--initial-pose", "a.npz"], "does nothing with --initial-pose"),
         (["--sharpness", "9"], "does nothing for --method apf on silhouettes alone"),
         (["--delays", "[0,0,8]"], "got 8 for"),

@@ -454,7 +454,8 @@ def test_lists_are_separated_by_blanks_or_commas():
     # a list of one word may stand before what is given by its place
     lists = ("--camera-names", "a,b,c", "--delays", "[0,3,10]", "--facing", "[-1,0,0.5]")
     assert read(*lists, *files) == read(files[0], *lists, *files[1:]) == expected
-    assert read(*files[:2], "--camera-names", "a")[0] == ["a"]
+    assert read(*files[:2], "--camera-names", "a", "--delays", "12")[:2] == (["a"], [12])
+    assert read(*files[:2], "--delays", "null")[1] is None
 
 
 def test_tables_that_are_no_cameras_are_said(torchpose, scene, tmp_path):
@@ -589,6 +590,15 @@ def test_an_unknown_rate_is_said(track, tmp_path):
     assert (done.code, "no input states a frame rate: 30 fps assumed" in done.out) == (0, True)
 
 
+@pytest.mark.parametrize("overlay", ["false", "true"])
+def test_videos_tell_the_rate_whether_or_not_they_are_drawn_into(track, tmp_path, overlay):
+    words = ("--videos", "front.mp4", "--height", 1.75, "--overlay", overlay)
+    done = track(tmp_path, "front_json", "--camera-names", "[front]", *words, *PLAIN)
+    assert done.code == 0, done.err
+    assert "30 fps assumed" not in done.out
+    assert BodyTrack.load(tmp_path / "body.npz").fps == FPS
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -629,11 +639,13 @@ def test_an_unknown_rate_is_said(track, tmp_path):
         ),
         ((*MIXED, "--method", "sir", "--rows", 80), "--rows is for silhouettes"),
         ((*MIXED, "--method", "mrpf"), "needs manifold"),
-        ((*MIXED, "--method", "ekf"), "ekf"),
+        ((*MIXED, "--method", "ekf"), "must be one of kalman, mrpf, apf"),
         ((*MIXED, "--detector", "a.onnx"), "all inputs are keypoints"),
         ((*MIXED, "--min-confidence", 0.5), "--min-confidence is for --detector"),
         ((*MIXED, "--videos", "front.mp4"), "--videos needs 3 entries, one for each camera, got 1"),
         ((*MIXED, "--delays", "[1]"), "--delays needs 3 entries, one for each camera, got 1"),
+        ((*MIXED, "--delays", "[0,1.5,0]"), "--delays must be whole numbers of frames, such as"),
+        ((*MIXED, "--videos", "a.mp4", "b.mp4", "c.mp4"), "a.mp4: no such file"),
         ((*MIXED, "--formats", "fbx"), "--formats must be one of trc, c3d, bvh"),
         (
             ("front.mp4", "left.mp4", "behind.mp4", "--up", "z"),

@@ -22,7 +22,7 @@ def settings_of(settings: Mapping[str, Any]) -> StreamSettings:
     Args:
         settings: by name; None where there is none.
     """
-    found = {}
+    found: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, Mapping):
             found[name] = str(sorted((str(key), str(one)) for key, one in value.items()))

@@ -17,6 +17,8 @@ from torchpose.cli._track_body_options import (
     check_numbers,
     check_values,
     filter_options,
+    parse_delays,
+    parse_facing,
     parse_names,
     parse_persons,
     refuse_unsuited,
@@ -78,7 +80,12 @@ def command() -> Command:
             "method_options": filter_options(),
         },
         spaced=("inputs", "background", "videos", "formats"),
-        parse={"persons": parse_persons, "camera_names": parse_names},
+        parse={
+            "persons": parse_persons,
+            "camera_names": parse_names,
+            "delays": parse_delays,
+            "facing": parse_facing,
+        },
         metavars={
             "cameras": "FILE|fx,fy,cx,cy|uncalibrated",
             "inputs": "INPUT",

@@ -108,7 +108,13 @@ def track_keypoints(
         shown = list(inputs)
     overlay = job.overlay and shown is not None
     with ExitStack() as stack:
-        wanted = overlay or job.pictures or settings.silhouettes is not None
+        # videos that are named are read for their rate, also if nothing is drawn into them
+        wanted = (
+            overlay
+            or job.pictures
+            or settings.silhouettes is not None
+            or settings.videos is not None
+        )
         films = stack.enter_context(_films(shown if wanted else None, cameras, settings))
         results = stack.enter_context(
             body_results(job, cameras, overlay, _further_files(job, shown is not None, settings))

@@ -4,7 +4,7 @@ import re
 from argparse import ArgumentError
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from torchpose._core.checks import check_choice, check_height, check_positive
 from torchpose._core.wording import counted
@@ -14,6 +14,8 @@ from torchpose.cli._track import is_video
 from torchpose.cli._track_body_output import KALMAN
 from torchpose.cli._uncalibrated import is_tilt_told, needs_no_file
 from torchpose.errors import InputError
+
+Number = TypeVar("Number", int, float)
 
 PYTHON_ONLY = frozenset({
     "weights", "proposal", "process_cov", "likelihood", "limit_mode", "resampling",
@@ -62,6 +64,36 @@ def parse_names(value: Any) -> list[str]:
     """Return names from a list, or from text with commas and perhaps brackets."""
     words = value if isinstance(value, list) else str(value).strip("[] ").split(",")
     return [str(word).strip().strip("'\"") for word in words]
+
+
+def parse_delays(value: Any) -> list[int] | None:
+    """Return whole numbers from a list, from text with commas and perhaps brackets, or from one number.
+
+    It is None for null, as configurations have it.
+
+    Raises:
+        ArgumentError: anything else.
+    """
+    return _numbers(value, "--delays", int, "whole numbers of frames, such as 0,3,12")
+
+
+def parse_facing(value: Any) -> list[float] | None:
+    """Return numbers, as `parse_delays`.
+
+    Raises:
+        ArgumentError: anything else.
+    """
+    return _numbers(value, "--facing", float, "three numbers, such as 1,0,0")
+
+
+def _numbers(value: Any, flag: str, kind: type[Number], wanted: str) -> list[Number] | None:
+    if value in (None, "null"):
+        return None
+    words = value if isinstance(value, list) else str(value).strip("[] ").split(",")
+    try:
+        return [kind(str(word)) for word in words]
+    except ValueError as error:
+        raise ArgumentError(None, f"{flag} must be {wanted}, got {value!r}") from error
 
 
 def check_numbers(inputs: Sequence[str], cameras: Sequence[str]) -> None:

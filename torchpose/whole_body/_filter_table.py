@@ -26,6 +26,7 @@ from torchpose.whole_body._filters.manifold_regularised import ManifoldParticleF
 from torchpose.whole_body._filters.root_uncertainty import RootUncertaintyTracker
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._filters.sir import SIRParticleFilter
+from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 
 _DEFAULT = "apf"  # needs nothing
 _DEPRECATED = {"step_std"}  # options that still work and are not listed
@@ -216,6 +217,8 @@ def choose_method(method: str | None, given: Collection[str]) -> str:
                 f"filters; choose by method {' or '.join(wanted)}"
             )
         return wanted[0] if wanted else _DEFAULT
+    if method not in METHODS:
+        check_choice("method", method, (KEYPOINT_METHOD, *METHODS))
     _check_method(method)
     needs = METHODS[method].needs
     if needs is not None and needs not in given:
