@@ -85,6 +85,13 @@ def test_everybody_whom_a_detector_finds_has_poses(track, folder):
     assert apart.tolist() == pytest.approx([200.0, 10.0], abs=6)
 
 
+@pytest.mark.parametrize("more", [(), ("--max-persons", "1")])
+def test_a_height_of_several_persons_is_said(track, more):
+    done = track("--detector", "some_detectors:two", "--height", "1.5", "--overlay", "false", *more)
+    assert done.code == 0, done.err
+    assert ("--height was taken for each of the 2 persons" in done.out) == (not more)
+
+
 class Blank:
     """A camera that shows nothing, at the rate of its own clock."""
 
@@ -156,6 +163,7 @@ def test_persons_before_a_camera_have_the_names_that_they_had_while_it_ran(
         (("--detector", "some_detectors:none"), "expected package:factory"),
         (("--detector", "some_detectors:wrong"), "must return keypoints [N, 8, 2]"),
         (("--detector", "some_detectors:two", "--hands", "mean-shift"), "hands is of the measurer"),
+        (("--detector", "some_detectors:two", "--elbows", "false"), "elbows is of the measurer"),
         (("--detector", "some_detectors:two", "--face-model", "f.tflite"), "give one of them"),
         (("--detector", "some_detectors:two", "--nose-as-head", "true"), "is for keypoints"),
     ],

@@ -192,8 +192,8 @@ def test_wrists_choose_the_method_as_in_files(prior):
 def test_what_a_detector_replaces_is_refused(prior):
     detector = Performers(0.0)
     for option in (
-        {"hands": "mean-shift"}, {"background": True}, {"elbows": True}, {"edges": True},
-        {"candidates": True}, {"face_detector": HaarFaceDetector()},
+        {"hands": "mean-shift"}, {"background": True}, {"elbows": True}, {"elbows": False},
+        {"edges": True}, {"candidates": True}, {"face_detector": HaarFaceDetector()},
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"^{next(iter(option))} is of the measurer of faces"):
             VideoTracker(prior, CAMERA, detector=detector, **option)
@@ -205,6 +205,6 @@ def test_what_a_detector_replaces_is_refused(prior):
         VideoTracker(prior, CAMERA, detector=object())
     with pytest.raises(InputError, match=r"model\.pt: a detector must be an ONNX model"):
         VideoTracker(prior, CAMERA, detector="model.pt")
-    tracker = VideoTracker(prior, CAMERA, detector=detector, elbows=False)  # asks for nothing
+    tracker = VideoTracker(prior, CAMERA, detector=detector)
     with pytest.raises(InputError, match="state of this tracker"):
         tracker.step(VideoTracker(prior, CAMERA).init(), FRAMES[0])

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.io._results import ResultsFolder
     from torchpose.priors._upper_body_prior import UpperBodyPrior
+    from torchpose.upper_body._keypoint_files import TrackSettings
     from torchpose.upper_body._pose_track import PoseTrack
     from torchpose.video._measurers import Found
     from torchpose.video._recording import TrackedPerson
@@ -88,6 +89,7 @@ def track_video(
         if not people:
             detector = options["detector"]
             return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
+        notes += _note_on_facts(settings, len(people))
         method = f"{people[0].track.method}{smoothing_text(settings.smoothing)}"
         facts = {
             "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
@@ -340,6 +342,19 @@ def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
     for place, person in enumerate(people, 1):
         written += write_track(person.track, out, person_suffix(place))
     return written
+
+
+def _note_on_facts(settings: "TrackSettings", n_people: int) -> tuple[str, ...]:
+    """Return a note where what was told of one person was taken for each of several."""
+    facts = [
+        name for name in ("height", "bone_lengths", "person") if getattr(settings, name) is not None
+    ]
+    if n_people == 1 or not facts:
+        return ()
+    flag = f"--{facts[0].replace('_', '-')}"
+    return (
+        f"{flag} was taken for each of the {n_people} persons; --max-persons 1 tracks one of them",
+    )
 
 
 def _notes_of_all(people: list["TrackedPerson"], names: list[str]) -> tuple[str, ...]:

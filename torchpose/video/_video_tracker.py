@@ -194,7 +194,7 @@ class VideoTracker(nn.Module):
             )
         else:
             _refuse_measurer(
-                hands=hands != HAND_TRACKERS[0], background=background, elbows=bool(elbows),
+                hands=hands != HAND_TRACKERS[0], background=background, elbows=elbows is not None,
                 edges=edges,
                 candidates=candidates, face_detector=face_detector is not None,
                 head_neck=head_neck is not None,
