@@ -150,6 +150,7 @@ def test_where_nobody_stands_the_camera_is_taken_to_be_level(track, scene, tmp_p
     ("cameras", "words", "said"),
     [
         ("uncalibrated", ("seen.npz", "--tilt", 5, "--up", "y"), "leave --up out"),
+        ("uncalibrated", ("seen.npz", "--up", "z"), "the world of uncalibrated has y up"),
         ("uncalibrated", ("seen.npz", "--tilt", 80), "at most 60"),
         ("cameras.toml", ("seen.npz", "--roll", 5), "--roll is for a camera without a file"),
         ("uncalibrated", ("json",), "give the video by --videos, fx,fy,cx,cy"),

@@ -193,6 +193,11 @@ def _check_without_file(given: Given, by_keypoints: bool) -> None:
     given.refuse(("camera_names",), f"camera files, and {cameras} stands for one camera")
     if is_tilt_told(given.values) and given.values["up"] is not None:
         raise InputError("--tilt and --roll tell which way is up; leave --up out, or them")
+    if given.values["up"] == "z":
+        raise InputError(
+            f"the world of {cameras} has y up, got --up z; --up y says that the camera is level, and --tilt "
+            "and --roll how else it is held"
+        )
 
 
 def _refuse_beside_keypoints(given: Given, method: str | None) -> None:

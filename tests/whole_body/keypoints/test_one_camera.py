@@ -1,6 +1,7 @@
 """One camera does not tell how large and how far a person is, which covariances say, and its height does."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -212,6 +213,23 @@ def test_a_camera_of_known_height_finds_how_large_a_person_is(height):
     away = ray_of(given, found)
     wide, narrow = (float((away @ t.covariance3d[-1, 0] @ away).sqrt()) for t in (without, found))
     assert narrow < 0.6 * wide
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(0.0, None), (-1.2, "feet are 1.* m below the floor"), (1.2, "m above the floor")],
+)
+def test_a_height_of_the_camera_that_fits_no_person_is_said(error, said):
+    """It is in the axes of a wrong rotation, or the person stands elsewhere; the size is then a guess."""
+    given = scene(1, 20)
+    floor = float(given.joints[..., 1].min()) - _ANKLE
+    centre = -(given.rig.rotation[0].mT @ given.rig.translation[0])
+    height = float(centre[1]) - floor + error
+    notes = " ".join(track(given, up="y", camera_height=height).notes)
+    assert "camera_height" not in notes if said is None else re.search(said, notes)
+    legs = hidden(given, LEGS, slice(0, 20))
+    notes = " ".join(track(legs, up="y", camera_height=height).notes)
+    assert "no foot was seen, so camera_height told nothing" in notes
 
 
 def test_live_steps_find_the_size_of_whole_sequences():

@@ -16,7 +16,7 @@ import math
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
@@ -64,6 +64,17 @@ class Floor(NamedTuple):
     centre: Tensor
     height: float
 
+    def lower_ankle(
+        self, ankles: Float[Tensor, "*batch 2 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Int[Tensor, "*batch"]]:
+        """Return how far below the camera the lower ankle is, metres, and which it is."""
+        below, lower = ((self.centre - ankles) @ self.up).max(-1)
+        return below, lower
+
+    def above(self, ankles: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch"]:
+        """Return by how much the lower ankle is above where one is that stands on the floor, metres."""
+        return self.height - _ANKLE - self.lower_ankle(ankles)[0]
+
 
 def told_by_floor(
     size: SizeBelief,
@@ -78,7 +89,7 @@ def told_by_floor(
         size: before it. floor: of the room. ankles: of bodies of the filter's size, metres.
         trust: probability that an ankle was seen. fps: frames per second.
     """
-    below, lower = ((floor.centre - ankles) @ floor.up).max(-1)
+    below, lower = floor.lower_ankle(ankles)
     seen = trust.gather(-1, lower[:, None]).squeeze(-1)
     grown = below * size.log.exp()
     H = torch.stack([grown, torch.ones_like(grown)], -1)

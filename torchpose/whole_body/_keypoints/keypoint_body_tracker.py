@@ -397,7 +397,8 @@ def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -
     if up is None:
         raise InputError(
             "camera_height is measured along the vertical, which is not known; "
-            'give up as well, "y" or "z", the axis of the cameras\' world that points up'
+            'give up as well, "y" or "z", the axis of the cameras\' world that points up (without a file of '
+            "the camera, --tilt or --up y)"
         )
 
 

@@ -21,6 +21,7 @@ _LEAST_TURN = (
 )
 _STRAYS = 30.0  # percent of its frames in which a camera has a detection that fits no person
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
+_OFF_THE_FLOOR = 0.2  # metres of feet in half of the frames, from which on it is said
 _DOWN = 0.5  # of a unit vector, along the columns of an image
 _LYING = 60.0  # degrees of the trunk from the axis that points up, from which on it is said
 _LEANS = 8.0  # degrees by which trunk and legs lean in most images of a camera that may be rolled
@@ -139,6 +140,28 @@ def notes_on_size(height: float, n_cameras: int, sized: bool) -> tuple[str, ...]
     return (
         f"the estimated bones are those of a person of {height:.2f} m; if that is wrong, the cameras are not "
         "in metres, or the keypoints are of images of another size than the calibrated ones",
+    )
+
+
+def notes_on_camera_height(
+    off: Float[Tensor, " T"], seen: Bool[Tensor, " T"], height: float
+) -> tuple[str, ...]:
+    """Return a note if the given height of the only camera told nothing, or agrees with no size of a person.
+
+    Args:
+        off: metres by which the lower ankle is above where one is that stands on the floor. seen: whether
+            it was seen. height: of the camera, metres.
+    """
+    if not bool(seen.any()):
+        return ("no foot was seen, so camera_height told nothing of the person's size",)
+    away = float(off[seen].median())
+    if abs(away) < _OFF_THE_FLOOR:
+        return ()
+    side = "above" if away > 0 else "below"
+    return (
+        f"camera_height does not fit: feet are {abs(away):.1f} m {side} the floor of a camera at {height:g} m "
+        "with any likely size of the person, so their size and distance are not to be trusted; check the "
+        "height, whether the person stands on that floor, and up, tilt or the rotation of the camera",
     )
 
 

@@ -57,11 +57,18 @@ class OnlyCamera:
         """Return the place of the camera."""
         return self.filter.maps.centre[0]
 
+    @property
+    def floor(self) -> Floor | None:
+        """Return the floor that tells the size, None if it is not known where it is."""
+        if self.height is None or self.filter.upright is None:
+            return None
+        return Floor(self.filter.upright.direction, self.centre, self.height)
+
     def at_size(self, step: KeypointStep) -> KeypointStep:
         """Return a frame at the sizes that are believed after it."""
         stream, pose, found = step
-        if self.height is not None and self.filter.upright is not None:
-            floor = Floor(self.filter.upright.direction, self.centre, self.height)
+        floor = self.floor
+        if floor is not None:
             trust = found.weighed.inlier[:, 0, ANKLES] * stream.begun[:, None]
             ankles = found.joints[:, ANKLES]
             size = told_by_floor(stream.size, floor, ankles, trust, self.filter.fps)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.body._feet import ANKLES
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
@@ -27,6 +28,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_of,
     notes_on_a_rolled_camera,
+    notes_on_camera_height,
     notes_on_left_out_cameras,
     notes_on_size,
     notes_on_still_cameras,
@@ -40,6 +42,7 @@ from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
+_SEEN = 0.5  # probability that a keypoint is of its joint
 KEYPOINT_METHOD = "kalman"
 CAMERA_TURN = "camera_turn"
 """Name of the detail of cameras that are turned, there where any is."""
@@ -152,6 +155,12 @@ class TrackBuilder:
         notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
         notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)
         notes += notes_on_up(self.tracker.filter.up, poses.joints)
+        floor = None if self.tracker.only is None else self.tracker.only.floor
+        if floor is not None:
+            seen = (poses.inlier[:, 0, ANKLES] > _SEEN).any(-1)
+            notes += notes_on_camera_height(
+                floor.above(poses.joints[:, ANKLES]), seen, floor.height
+            )
         turned = notes_on_turned_cameras(self.rig.names, angles_of(poses.turn), first_frame)
         notes += notes_on_left_out_cameras(self.rig.names, poses.off, first_frame) + turned
         if len(self.rig) == 1 and self.tracker.filter.up is None:
