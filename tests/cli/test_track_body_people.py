@@ -108,6 +108,14 @@ def test_without_persons_a_note_says_where_several_stand(track, tmp_path):
     assert "several people" not in track(tmp_path, *BOTH, "--persons", "all", *PLAIN).out
 
 
+def test_people_beyond_the_announced_number_are_said(track, tmp_path):
+    said = "a camera shows up to 2 people at a time, in 75 % of the frames more than the 1 who may be tracked"
+    for persons in (1, 2, "all"):
+        done = track(tmp_path, *BOTH, "--persons", persons, *PLAIN)
+        assert done.code == 0, done.err
+        assert (said in done.out) == (persons == 1)
+
+
 def test_nobody_on_whom_cameras_agree(track, scene, tmp_path):
     words = ("front_json", "--camera-names", "[front]", "--persons", "all", *PLAIN)
     assert track(tmp_path / "a", *words).code == 0  # one camera agrees with itself

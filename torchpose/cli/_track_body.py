@@ -174,7 +174,8 @@ def run(
             have 1). It is not for root, nor for apf without keypoints, which compute theirs.
         method_options: the options of the filter.
         fps: the frame rate of the keypoints, and at which all videos are read.
-        delays: the number of frames to skip at the beginning of each input (default none).
+        delays: the number of frames to skip at the beginning of each input, at the rate of fps if it is given
+            (default none).
         seed: the seed of the filter; kalman has none.
         formats: also write the poses as body.trc, body.c3d or body.bvh.
         up: the axis of the cameras' world that points up: kalman expects people upright along it, and the

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 _CAMERAS = "refined_cameras.toml"
 _TILT_SECONDS = 60.0  # of the beginning, in which people tell how the camera is held
 _AGREES = 0.5  # share of the keypoints of a camera in a frame, above which it agrees with the body
+_OTHERS = 0.1  # share of frames with more people than are tracked, from which on it is said
 _DISAGREE = (
     "no two cameras agree on where the person is in more than half of the frames, so the poses are not to be "
     "trusted; the notes say what to check"
@@ -263,8 +264,23 @@ def _track(
         except NobodySeenError:
             return []
     people = [found] if settings.persons is None else found
-    notes = (*keypoints.notes, *(() if recordings is None else recordings.all_notes))
+    notes = (*keypoints.notes, *_note_on_others(keypoints, settings.persons))
+    notes += () if recordings is None else recordings.all_notes
     return [replace(poses, notes=(*notes, *poses.notes)) for poses in people]
+
+
+def _note_on_others(keypoints: BodyKeypoints, persons: str | int | None) -> tuple[str, ...]:
+    """Return a note if cameras often show more people than are tracked at a time."""
+    if not isinstance(persons, int):
+        return ()
+    shown = (keypoints.confidence > 0).any(-1).sum(-1).amax(1)
+    share = float((shown > persons).double().mean())
+    if share < _OTHERS:
+        return ()
+    return (
+        f"a camera shows up to {int(shown.max())} people at a time, in {percent(share)} of the frames more "
+        f"than the {persons} who may be tracked: others are left out (--persons all)",
+    )
 
 
 def _in_pixels_of(settings: KeypointSettings, scale: float) -> KeypointSettings:

@@ -159,8 +159,8 @@ def notes_on_camera_height(
         return ()
     side = "above" if away > 0 else "below"
     return (
-        f"camera_height does not fit: feet are {abs(away):.1f} m {side} the floor of a camera at {height:g} m "
-        "with any likely size of the person, so their size and distance are not to be trusted; check the "
+        f"camera_height does not fit: feet are {abs(away):.1f} m {side} the floor of a camera at {height:g} "
+        "m with any likely size of the person, so their size and distance are not to be trusted; check the "
         "height, whether the person stands on that floor, and up, tilt or the rotation of the camera",
     )
 
