@@ -49,20 +49,26 @@ def find_keypoints(paths: Sequence[str | Path], leave_out: str | Path | None = N
         paths: files and folders. leave_out: a folder that is not searched: that of the results.
 
     Raises:
-        InputError: no such path, a file of another kind, no recordings, or two whose results would
-            have one name.
+        InputError: no such path, that of the results, a file of another kind, no recordings, or two whose
+            results would have one name.
     """
     found: dict[str, Path] = {}
     others: dict[str, str] = {}
     skipped = None if leave_out is None else Path(leave_out).resolve()
+    inside = [path for path in paths if skipped == Path(path).resolve()]
+    if inside:
+        raise InputError(
+            f"{inside[0]}: is the folder of the results, which is not searched for recordings; choose another "
+            "--out"
+        )
     for given in map(Path, paths):
         for name, path, fault in _candidates_in(given, skipped):
             if fault:
                 others[str(path)] = fault
             elif found.setdefault(name, path).resolve() != path.resolve():
                 raise InputError(
-                    f"{found[name]} and {path}: both results would be called {name}.npz; rename one, "
-                    "or give the folder above both"
+                    f"{found[name]} and {path}: both results would be called {name}.npz; rename one"
+                    + ", or give the folder above both" * (found[name].parent != path.parent)
                 )
     if not found:
         raise InputError(

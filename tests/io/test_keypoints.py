@@ -254,6 +254,8 @@ def test_columns_of_other_spellings(tmp_path, spelling):
     assert read.notes == plain.notes == ()
     x, y, _ = spelling.split(",")
     assert is_keypoint_header(["time", x, y])
+    assert is_keypoint_header(["Timestamp (ms)", "name", "x", "y", "z"])
+    assert not is_keypoint_header(["name", "x", "y"])
     assert not is_keypoint_header(["time", x, y, y.replace("Y", "Z").replace("y", "z")])
 
 

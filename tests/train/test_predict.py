@@ -102,6 +102,15 @@ def test_results_are_those_of_torchpose_track(data, prior_file, tmp_path) -> Non
     assert float(row["missing"]) == pytest.approx(3 / 36)  # every fourth left hand of 3 joints
 
 
+def test_no_smoothing_is_said_as_on_the_command_line(data, prior_file, tmp_path) -> None:
+    for said in ("none", None):
+        predict(
+            [data / "a.npz"], tmp_path / str(said), TrackSettings(prior=prior_file, smoothing=said)
+        )
+    found, expected = (PoseTrack.load(tmp_path / str(said) / "a.npz") for said in ("none", None))
+    torch.testing.assert_close(found.joints3d, expected.joints3d, rtol=0, atol=0)
+
+
 def test_settings_are_the_options_of_track() -> None:
     own = asdict(TrackSettings())
     theirs = vars(track_command().parser().get_defaults())
@@ -256,8 +265,14 @@ def test_openpose_folders_csv_and_names_that_clash(tmp_path) -> None:
     (tmp_path / "film.mp4").write_bytes(b"")
     with pytest.raises(InputError, match="`torchpose track` takes videos"):
         find_keypoints([tmp_path / "film.mp4"])
+    (tmp_path / "clips" / "times.csv").write_text("time,name,x,y\n0,head,1,2\n")
+    assert "times" in [r.name for r in find_keypoints([tmp_path / "clips"]).recordings]
     with pytest.raises(InputError, match="found none"):
         find_keypoints([tmp_path / "clips"], leave_out=tmp_path)
+    with pytest.raises(
+        InputError, match=r"clips: is the folder of the results.*choose another --out"
+    ):
+        find_keypoints([tmp_path / "clips"], leave_out=tmp_path / "clips")
 
 
 def test_results_inside_the_recordings_are_no_recordings(data, prior_file) -> None:

@@ -123,6 +123,8 @@ class TrackSettings:
         names = ("smoothing", "frame", "static_camera", "outliers")
         options = {name: getattr(self, name) for name in names}
         options |= {"method": method, "steady": steady}
+        if self.smoothing == "none":  # as a configuration may say it
+            options["smoothing"] = None
         if self.window and method is None:
             options["window"] = True  # windows, which were the default
         for name in ("n_particles", "n_tracks"):

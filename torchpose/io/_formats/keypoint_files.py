@@ -51,8 +51,14 @@ _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a d
 
 
 def is_keypoint_header(cells: Sequence[str]) -> bool:
-    """Return whether the cells of a first line name frames or x and y alone, or begin DeepLabCut's header."""
-    if any(cell.lower() in (*_FRAMES, "scorer") for cell in cells):
+    """Return whether the cells of a first line name frames or x and y alone, or begin DeepLabCut's header.
+
+    Times beside names of keypoints stand for frames.
+    """
+    lower = {cell.lower() for cell in cells}
+    if not lower.isdisjoint((*_FRAMES, "scorer")):
+        return True
+    if lower >= {"x", "y"} and not lower.isdisjoint(_NAMES) and any(map(is_time, cells)):
         return True
     ends = _ends(cells)
     return ends >= {"_x", "_y"} and "_z" not in ends
