@@ -58,8 +58,8 @@ def find_keypoints(paths: Sequence[str | Path], leave_out: str | Path | None = N
     inside = [path for path in paths if skipped == Path(path).resolve()]
     if inside:
         raise InputError(
-            f"{inside[0]}: is the folder of the results, which is not searched for recordings; choose another "
-            "--out"
+            f"{inside[0]}: is the folder of the results, which is not searched for recordings; choose "
+            "another --out"
         )
     for given in map(Path, paths):
         for name, path, fault in _candidates_in(given, skipped):
