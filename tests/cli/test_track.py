@@ -245,6 +245,11 @@ def test_frame_rate(track, tmp_path, files):
     same(poses, expected(files))
     done, poses = track("--fps", 15, clip=tmp_path / "clip.npz")
     assert poses.fps == 15 and "note" not in done.out
+    done, poses = track("--fps", 15)
+    assert (
+        poses.fps == 15 and "note     keypoints of 30 fps are taken at the given 15 fps" in done.out
+    )
+    assert "note" not in track("--fps", 30)[0].out
 
 
 # --- cameras --------------------------------------------------------------------------------------
@@ -351,6 +356,7 @@ def test_several_people_and_numbers_of_files_are_noted(track, files, tmp_path):
         people = [{"pose_keypoints_2d": table.flatten().tolist()}] * (2 if t == 7 else 1)
         (tmp_path / f"clip_{100 + t:06d}_keypoints.json").write_text(json.dumps({"people": people}))
     done, _ = track("--camera", "525,525,319.5,239.5", "--neck", "neck", clip=tmp_path)
+    assert "one of kind neck, as --neck says, and not mid-shoulder, as the joint set" in done.out
     assert "several people, up to 2, from frame 7 on" in done.out
     assert "frame 0 is number 100" in done.out
 
@@ -377,6 +383,7 @@ BAD_INPUT = {
     "no upper body": (["{tmp}/knees.npz"], "expected some of hand_left"),
     "no camera": (["{tmp}/no_camera.npz"], "expected --camera FILE"),
     "long gap": (["{tmp}/gap.npz"], "longer than max_gap"),
+    "no name of a folder": ([CLIP, "--out", ""], "expected a folder for the results"),
     "unwritable": ([CLIP, "--out", "{tmp}/notes.txt/below"], "cannot be written to this folder"),
     "no such prior": ([CLIP, "--prior", "nobody"], "expected the name of a prior"),
     "foreign prior": ([CLIP, "--prior", CLIP], "expected a prior as safetensors"),

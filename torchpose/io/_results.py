@@ -42,7 +42,7 @@ class ResultsFolder:
         earlier: whether a folder without a list holds results of an earlier version.
 
     Raises:
-        OutputError: when entered: a folder that cannot be written to, an output that is an input, a
+        OutputError: a folder without a name; when entered: a folder that cannot be written to, an output that is an input, a
             file of somebody else's in the place of an expected one, or another run at work.
 
     Example:
@@ -63,6 +63,10 @@ class ResultsFolder:
         inputs: Iterable[str | Path] = (),
         earlier: Callable[[Path], bool] = lambda folder: False,
     ) -> None:
+        if not str(folder).strip():
+            raise OutputError(
+                "expected a folder for the results, got an empty name; give --out DIR"
+            )
         self.folder, self.notes = Path(folder), list[str]()
         self._kind, self._own, self._expected = kind, re.compile(own), list(expected)
         self._inputs, self._earlier = [Path(path) for path in inputs], earlier

@@ -23,6 +23,7 @@ from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
 _KEPT_TRACKERS = 8
+_SAME_RATE = 1e-3  # frames per second
 
 
 @dataclass(frozen=True)
@@ -256,7 +257,14 @@ class KeypointFileTracker:
         if fps is None:
             rate = self.prior.info.fps or 30
             more += (f"the keypoint file states no frame rate: {rate:g} fps assumed",)
+        elif keypoints.fps is not None and abs(fps - keypoints.fps) > _SAME_RATE:
+            more += (f"keypoints of {keypoints.fps:g} fps are taken at the given {fps:g} fps",)
         kind = _kind_of_neck(settings.neck, keypoints)
+        if keypoints.neck not in (None, kind):
+            more += (
+                f"the neck is taken for one of kind {kind}, as --neck says, and not {keypoints.neck}, as the "
+                "joint set or the file does",
+            )
         key = _Key(
             tuple(camera.matrix.flatten().tolist()),
             camera.image_size,
