@@ -42,8 +42,8 @@ class ResultsFolder:
         earlier: whether a folder without a list holds results of an earlier version.
 
     Raises:
-        OutputError: a folder without a name; when entered: one that cannot be written to, an output that is an
-            input, a file of somebody else's in the place of an expected one, or another run at work.
+        OutputError: a folder without a name; when entered: one that cannot be written to, an output that is
+            an input, a file of somebody else's in the place of an expected one, or another run at work.
 
     Example:
         >>> folder = tempfile.mkdtemp()
