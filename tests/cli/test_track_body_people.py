@@ -123,7 +123,9 @@ def test_nobody_on_whom_cameras_agree(track, scene, tmp_path):
     done = track(tmp_path / "b", *BOTH, "--persons", "all", *short, *PLAIN)
     assert done.code == 1
     assert "nobody was seen for long enough by cameras that agree" in done.err
-    assert not (tmp_path / "b" / "body.npz").exists()
+    assert not (tmp_path / "b" / "body.npz").exists() and "earlier run" not in done.err
+    done = track(tmp_path / "a", *BOTH, "--persons", "all", *short, *PLAIN)
+    assert done.code == 1 and "body.npz is of an earlier run" in done.err
 
 
 def test_a_detector_gives_everybody_in_videos(scene, tmp_path, monkeypatch):

@@ -29,6 +29,7 @@ from torchpose.cli._track_body_output import (
     action_text,
     body_results,
     gate_is_in_a_note,
+    report_nobody,
     summary,
     write_page,
     write_people,
@@ -239,11 +240,7 @@ def _run_on_silhouettes(
             )
             seconds = time.perf_counter() - start
             if poses is None:
-                print(
-                    "torchpose: nobody was seen by all cameras, so there are no poses",
-                    file=sys.stderr,
-                )
-                return 1
+                return report_nobody("nobody was seen by all cameras", results.folder)
             written = results.commit(write_people(job, results.stage, [poses]))
             shown: list[Path] = []
             if job.overlay or job.pictures:

@@ -31,6 +31,7 @@ from torchpose.cli._track_body_output import (
     action_text,
     body_results,
     gate_is_in_a_note,
+    report_nobody,
     summary,
     write_page,
     write_people,
@@ -133,8 +134,7 @@ def track_keypoints(
         people = _track(keypoints, settings, recordings)
         seconds = time.perf_counter() - start
         if not people:
-            print(f"torchpose: {_nobody(keypoints)}, so there are no poses", file=sys.stderr)
-            return 1
+            return report_nobody(_nobody(keypoints), results.folder)
         stage = results.stage
         drawn: list[Path] = []
         short: tuple[str, ...] = ()

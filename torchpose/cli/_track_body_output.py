@@ -49,6 +49,14 @@ class BodyJob(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
+def report_nobody(why: str, folder: Path) -> int:
+    """Print why there are no poses, and whether the folder has those of an earlier run; return 1."""
+    earlier = folder / _POSES[0]
+    said = f"; {earlier} is of an earlier run" if earlier.exists() else ""
+    print(f"torchpose: {why}, so there are no poses{said}", file=sys.stderr)
+    return 1
+
+
 def body_results(
     job: BodyJob, cameras: "Sequence[PinholeCamera]", overlay: bool, pictures: Sequence[str]
 ) -> "ResultsFolder":

@@ -323,7 +323,7 @@ def read_silhouettes(
     rates = {round(source.fps, 3) for source in sources}
     if len(rates) > 1:
         raise InputError(
-            f"videos must have one frame rate, got {sorted(rates)}; open them with a common fps"
+            f"videos must have one frame rate, got {sorted(rates)}; open them with a common fps (--fps)"
         )
     for frames in frames_in_step(sources, starts):
         masks = [m(frame.image) for m, frame in zip(measurers, frames, strict=True)]

@@ -28,6 +28,7 @@ from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 
 _ACROSS = 0.1  # metres: how far the middle of a silhouette lies from that of the body
 _DEPTH_SHARE = 0.1  # of a ray's information across it that its length has, from the person's height
+_VERTICAL = 0.87  # cosine to the vertical from which on a direction tells no heading
 _TILT = 0.1  # sine of half the angle by which a trunk leans, about each axis
 _PART = 0.15  # spread of the parts about the rest pose where there is no prior
 # standard deviations of the diffusion in the first and in the last layer
@@ -261,7 +262,13 @@ class _Sectors(NamedTuple):
 
 def _sectors(up: Float[Tensor, "3"], count: int, facing: Tensor | None) -> _Sectors:
     if facing is not None:
-        return _Sectors(_heading_of(up, _unit("facing", facing).to(up))[None], math.pi / 3)
+        facing = _unit("facing", facing).to(up)
+        if abs(float(facing @ up)) > _VERTICAL:
+            raise InputError(
+                "facing must be a direction along the floor, got one within 30 degrees of the vertical, "
+                f"which is {[round(value, 2) for value in up.tolist()]} in the axes of these cameras"
+            )
+        return _Sectors(_heading_of(up, facing)[None], math.pi / 3)
     return _Sectors(torch.arange(count).to(up) * (2 * math.pi / count), math.pi / count)
 
 

@@ -103,5 +103,9 @@ def test_what_the_search_refuses():
         find_pose(BODY, image, RIG, n_layers=1)
     with pytest.raises(InputError, match="direction"):
         find_pose(BODY, image, RIG, up=torch.zeros(3))
+    with pytest.raises(
+        InputError, match=r"along the floor.*vertical, which is \[0\.0, 1\.0, 0\.0\]"
+    ):
+        find_pose(BODY, image, RIG, facing=torch.tensor([0.1, -1.0, 0.0]))
     with pytest.raises(InputError, match="must hold 2, one for each sequence, got 1"):
         find_pose(BODY, torch.stack([image, image]), RIG, None, [generator()])
