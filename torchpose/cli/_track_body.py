@@ -1,6 +1,5 @@
 """`torchpose track-body`: keypoints or videos of calibrated cameras to the 3D poses of a whole body."""
 
-import sys
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
