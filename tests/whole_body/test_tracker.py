@@ -170,7 +170,7 @@ def test_a_frame_counts_if_every_camera_sees_somebody():
 @pytest.mark.parametrize(
     ("method", "options", "said"),
     [
-        ("ekf", {}, "method must be one of mrpf, apf, sir, root, constrained"),
+        ("ekf", {}, "method must be one of kalman, mrpf, apf, sir, root, constrained"),
         ("mrpf", {}, "needs manifold, a manifold of the action's poses"),
         ("sir", {"action": "exercises"}, "leave it out or take method constrained"),
         ("sir", {"n_layers": 3}, "'n_layers' does nothing for method sir.*it is of apf"),
