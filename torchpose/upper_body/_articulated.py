@@ -333,7 +333,8 @@ class ArticulatedFilter(Estimator):
         places, sure = measured.body
         matrix = self.optics.matrix
         rays = (places - matrix[:2, 2]) / matrix.diagonal()[:2]
-        return lift(_network_on(rays.device), rays, sure, self.model.rate, memory)
+        network, model = _network_on(rays.device), self.model
+        return lift(network, rays, sure, model.rate, memory, model.pitch)
 
     def _steps(
         self,

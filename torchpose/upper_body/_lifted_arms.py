@@ -8,10 +8,14 @@ length L whose direction it puts at v is likelier to point along d by the densit
 
 with the deviation s of its far end. The factor f is above 1, since the network errs alike in frames of one
 motion, and most for forearms of persons to whom it was not fitted.
+
+It has seen few people from below, and bends those forward, arms along with the trunk. Where the camera is
+known to look up, bones are turned back by a share of the lean of the lifted trunk (`share_of_lean`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
@@ -36,6 +40,10 @@ _FAR = ("left_shoulder", "left_elbow", "left_wrist", "right_elbow", "right_wrist
 _LENGTHS = (0.35, 0.28, 0.25, 0.28, 0.25)  # metres
 _ENDS = tuple(BODY_15.joint(name) for name in (*_NEAR, *_FAR))
 _SHOULDERS = [BODY_15.joint(name) for name in ("left_shoulder", "right_shoulder")]
+_NECK, *_HIP_JOINTS = (BODY_15.joint(name) for name in ("neck", "left_hip", "right_hip"))
+# Share of the lean that is turned back, and pitch of the camera from which on it is that much.
+_BACK, _FROM_BELOW = 0.5, math.radians(15.0)
+_MOST_LEAN = 0.6  # radians: who leans more bends down
 _FACTORS = (2.1, 2.5, 6.0, 2.5, 6.0)  # f; the line between the shoulders has two ends that err
 N_BONES = len(_FAR)
 """Number of bones that are lifted."""
@@ -102,6 +110,7 @@ def lift(
     confidence: Float[Tensor, "B T 15"],
     fps: float,
     memory: Float[Tensor, "B L W"] | None,
+    pitch: float | None = None,
 ) -> tuple[LiftedBones, Float[Tensor, "B L W"]]:
     """Return the directions of bones in T frames, and what the network remembers of them.
 
@@ -113,13 +122,43 @@ def lift(
     before = seen.new_zeros(len(seen), *MEMORY) if memory is None else memory
     (joints, std), after = network(seen, before)
     ends = index_tensor(_ENDS, rays.device)
-    near, far = joints.index_select(-2, ends).to(rays).split(N_BONES, -2)
+    joints = joints.to(rays)
+    near, far = joints.index_select(-2, ends).split(N_BONES, -2)
     ways, std = far - near, std.index_select(-1, ends[N_BONES:]).to(rays)
     there = confidence > 0
     left, right = _SHOULDERS
     enough = (there.sum(-1) >= _LEAST_JOINTS) & there[..., left] & there[..., right]
     precision = (_ratios(std.dtype, std.device) / std).square()
+    if share := share_of_lean(pitch):
+        ways = _turned_back(ways, share * _lean(joints))
     return LiftedBones(normalize(ways, dim=-1), precision * enough[..., None]), after
+
+
+def share_of_lean(pitch: float | None) -> float:
+    """Return the share of the lean of the lifted trunk by which bones are turned back.
+
+        0.5 min(p / 15 degrees, 1)
+
+    Args:
+        pitch: the angle p by which the camera looks up, radians; None if it is unknown, which is 0.
+    """
+    return _BACK * min(max(pitch or 0.0, 0.0) / _FROM_BELOW, 1.0)
+
+
+def _lean(joints: Float[Tensor, "B T 15 3"]) -> Float[Tensor, "B T"]:
+    """Return the angle by which a trunk leans away from the camera, radians, in axes that are level."""
+    hips = joints[..., _HIP_JOINTS, :].mean(-2)
+    _, down, away = (joints[..., _NECK, :] - hips).unbind(-1)
+    return torch.atan2(away, -down).clamp(-_MOST_LEAN, _MOST_LEAN)
+
+
+def _turned_back(
+    ways: Float[Tensor, "B T N 3"], lean: Float[Tensor, "B T"]
+) -> Float[Tensor, "B T N 3"]:
+    """Return directions of a body that leans away by so much, turned to where it is upright."""
+    x, y, z = ways.unbind(-1)
+    cos, sin = lean.cos()[..., None], lean.sin()[..., None]
+    return torch.stack([x, cos * y - sin * z, sin * y + cos * z], -1)
 
 
 @cache
