@@ -20,7 +20,7 @@ CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5)
 
 
 def seen_from(pitch, turn):
-    """Return somebody before a camera that looks down by an angle, turned, degrees, camera axes, [T, 8, 3]."""
+    """Return somebody who is turned, before a camera that looks down, degrees, camera axes, [T, 8, 3]."""
     clip = data_dir_or_skip("kinect_laban") / "Ges03_drawlines.csv"
     (recording,) = read_recordings([clip])
     joints = recording.upper_body().joints[:40].double()
