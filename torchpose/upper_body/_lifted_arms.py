@@ -40,7 +40,7 @@ _FAR = ("left_shoulder", "left_elbow", "left_wrist", "right_elbow", "right_wrist
 _LENGTHS = (0.35, 0.28, 0.25, 0.28, 0.25)  # metres
 _ENDS = tuple(BODY_15.joint(name) for name in (*_NEAR, *_FAR))
 _SHOULDERS = [BODY_15.joint(name) for name in ("left_shoulder", "right_shoulder")]
-_NECK, *_HIP_JOINTS = (BODY_15.joint(name) for name in ("neck", "left_hip", "right_hip"))
+_TRUNK = tuple(BODY_15.joint(name) for name in ("neck", "left_hip", "right_hip"))
 # Share of the lean that is turned back, and pitch of the camera from which on it is that much.
 _BACK, _FROM_BELOW = 0.5, math.radians(15.0)
 _MOST_LEAN = 0.6  # radians: who leans more bends down
@@ -122,15 +122,15 @@ def lift(
     before = seen.new_zeros(len(seen), *MEMORY) if memory is None else memory
     (joints, std), after = network(seen, before)
     ends = index_tensor(_ENDS, rays.device)
-    joints = joints.to(rays)
-    near, far = joints.index_select(-2, ends).split(N_BONES, -2)
+    near, far = joints.index_select(-2, ends).to(rays).split(N_BONES, -2)
     ways, std = far - near, std.index_select(-1, ends[N_BONES:]).to(rays)
     there = confidence > 0
     left, right = _SHOULDERS
     enough = (there.sum(-1) >= _LEAST_JOINTS) & there[..., left] & there[..., right]
     precision = (_ratios(std.dtype, std.device) / std).square()
     if share := share_of_lean(pitch):
-        ways = _turned_back(ways, share * _lean(joints))
+        trunk = joints.index_select(-2, index_tensor(_TRUNK, rays.device)).to(rays)
+        ways = _turned_back(ways, share * _lean(trunk))
     return LiftedBones(normalize(ways, dim=-1), precision * enough[..., None]), after
 
 
@@ -145,10 +145,14 @@ def share_of_lean(pitch: float | None) -> float:
     return _BACK * min(max(pitch or 0.0, 0.0) / _FROM_BELOW, 1.0)
 
 
-def _lean(joints: Float[Tensor, "B T 15 3"]) -> Float[Tensor, "B T"]:
-    """Return the angle by which a trunk leans away from the camera, radians, in axes that are level."""
-    hips = joints[..., _HIP_JOINTS, :].mean(-2)
-    _, down, away = (joints[..., _NECK, :] - hips).unbind(-1)
+def _lean(trunk: Float[Tensor, "B T 3 3"]) -> Float[Tensor, "B T"]:
+    """Return the angle by which a trunk leans away from the camera, radians, in axes that are level.
+
+    Args:
+        trunk: neck and both hips.
+    """
+    neck, left, right = trunk[..., 1:].unbind(-2)
+    down, away = (2 * neck - left - right).unbind(-1)
     return torch.atan2(away, -down).clamp(-_MOST_LEAN, _MOST_LEAN)
 
 
