@@ -117,6 +117,7 @@ def lift(
     Args:
         network: of the whole body. rays: (x, y) of K^-1 [u, v, 1]. confidence: 0 where there is no keypoint.
         fps: frames per second. memory: of the frames before; None at the beginning.
+        pitch: the angle by which the camera looks up, radians; None if it is unknown.
     """
     seen = lifting_features(rays, confidence, fps).to(network.places.weight)
     before = seen.new_zeros(len(seen), *MEMORY) if memory is None else memory
