@@ -61,29 +61,7 @@ def doubts_about(keypoints: Keypoints, neck_is_told: bool, up: Tensor | None) ->
     if keypoints.first_frame:
         yield f"frame 0 is number {keypoints.first_frame} of the file"
     joints = _Joints(keypoints)
-    upper, lower = _ends(joints)
-    rise, aside = _directions(joints.mean(upper) - joints.mean(lower), up)
-    alone = lower == _NECK
-    if _mostly(rise, -_ALONG):
-        said = (
-            "the head lies below the neck"
-            if alone
-            else "head and neck lie below shoulders and elbows"
-        )
-        yield (
-            f"{said} in most frames: rows of pixels count downwards, so keypoints that count upwards have to "
-            "be turned over"
-        )
-    if _mostly(-aside.abs(), -_ALONG):
-        said = (
-            "the head lies beside the neck"
-            if alone
-            else "head and neck lie beside shoulders and hips"
-        )
-        yield (
-            f"{said} in most frames: unless the person lies, v was given before u, or the video lies on its "
-            "side (--roll 90 or -90)"
-        )
+    yield from _turned(joints, up)
     if _mostly(_facing(joints, up), 0.0):
         yield (
             "the left shoulder is to the left of the right one in most frames, as from behind, and the nose "
@@ -94,15 +72,7 @@ def doubts_about(keypoints: Keypoints, neck_is_told: bool, up: Tensor | None) ->
             "the neck lies between the shoulders in most frames, and is taken for the prior's, which is 9 to "
             "13 cm above: --neck mid-shoulder says that it is their middle"
         )
-    lengths = {side: _longest_forearm(joints, side) for side in ("left", "right")}
-    shorter, longer = sorted(lengths, key=lambda side: lengths[side])
-    if lengths[shorter] < _SHORTER * lengths[longer]:
-        share = lengths[shorter] / lengths[longer]
-        yield (
-            f"the {shorter} forearm looks at most {100 * share:.0f} % as long as the {longer} one, and both "
-            "arms are taken to have bones of one length: unless it points along the line of sight all the "
-            f"time, its elbow comes out too bent; leave out the {shorter} wrist and hand"
-        )
+    yield from _shorter_forearm(joints)
 
 
 class _Joints:
@@ -125,6 +95,24 @@ class _Joints:
     def mean(self, names: Sequence[str]) -> Float[Tensor, "T 2"]:
         """Return the mean of the joints that are there in each frame."""
         return torch.stack([self(name) for name in names]).nanmean(0)
+
+
+def _turned(joints: _Joints, up: Tensor | None) -> Iterator[str]:
+    """Yield a note on each way in which the image seems to be turned: upside down, on its side."""
+    upper, lower = _ends(joints)
+    rise, aside = _directions(joints.mean(upper) - joints.mean(lower), up)
+    alone = lower == _NECK
+    subject = "the head lies" if alone else "head and neck lie"
+    if _mostly(rise, -_ALONG):
+        yield (
+            f"{subject} below {'the neck' if alone else 'shoulders and elbows'} in most frames: rows of "
+            "pixels count downwards, so keypoints that count upwards have to be turned over"
+        )
+    if _mostly(-aside.abs(), -_ALONG):
+        yield (
+            f"{subject} beside {'the neck' if alone else 'shoulders and hips'} in most frames: unless the "
+            "person lies, v was given before u, or the video lies on its side (--roll 90 or -90)"
+        )
 
 
 def _ends(joints: _Joints) -> tuple[Sequence[str], Sequence[str]]:
@@ -164,6 +152,19 @@ def _between_shoulders(joints: _Joints) -> bool:
     to_head, to_neck = joints("head") - middle, joints("neck") - middle
     share = (to_neck * to_head).sum(-1) / to_head.square().sum(-1)
     return _mostly(torch.where(both, share, torch.nan), _LOW_NECK)
+
+
+def _shorter_forearm(joints: _Joints) -> Iterator[str]:
+    """Yield a note if one forearm always looks much shorter than the other."""
+    lengths = {side: _longest_forearm(joints, side) for side in ("left", "right")}
+    shorter, longer = sorted(lengths, key=lambda side: lengths[side])
+    if lengths[shorter] < _SHORTER * lengths[longer]:
+        share = lengths[shorter] / lengths[longer]
+        yield (
+            f"the {shorter} forearm looks at most {100 * share:.0f} % as long as the {longer} one, and both "
+            "arms are taken to have bones of one length: unless it points along the line of sight all the "
+            f"time, its elbow comes out too bent; leave out the {shorter} wrist and hand"
+        )
 
 
 def _longest_forearm(joints: _Joints, side: str) -> float:
