@@ -12,8 +12,9 @@ Camera and noise are those of `score`. Covariances are not calibrated.
 import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -96,34 +97,16 @@ def run(
         check_count("counts", count)
     out = check_output_folder(out)
     known = list(recipes or [("this recipe", fit_kinect_prior), *map(_imported, compare)])
-    folders, further, usual = _sources(data, more)
-    recordings, notes = read_known_persons(folders)
-    persons = by_person(recordings)
-    if len(persons) < 2:
-        raise InputError(f"a learning curve needs two persons or more, got {', '.join(persons)}")
-    counts = counts or usual or _doubling(len(persons) - 1)
+    persons, others, counts, notes = _read(data, more, counts, quick)
     if quick:
-        persons = {name: group[::5] for name, group in persons.items()}
-        counts, n_subsets, n_own = tuple(c for c in counts if c in counts[:2]), 2, min(1, n_own)
-    others, more_notes = _further_persons(further, len(persons) - 1, max(counts))
-    refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
+        n_subsets, n_own = 2, min(1, n_own)
     settings = fit_settings(
         "learning-curve", seed, quick, n_components, window_components, window_samples, 0
     )
     scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
-    divided = [name for name, group in persons.items() if len(group) > 1]
-    jobs = {
-        (name, count, i): _curve_job(persons, others, subset, count, settings, recipe, scoring)
-        for name, recipe in known
-        for count in counts
-        for i, subset in enumerate(cyclic_subsets(list(persons), count, n_subsets))
-    }
-    own = {
-        (name, person, kind): job
-        for name, recipe in known
-        for person in divided[:n_own]
-        for kind, job in _own_jobs(persons, person, settings, recipe, scoring).items()
-    }
+    fittings = {name: _Fitting(settings, recipe, scoring) for name, recipe in known}
+    jobs = _curve_jobs(persons, others, counts, n_subsets, fittings)
+    own = _own_jobs(persons, n_own, fittings)
     folder = check_output_folder(fits or out)
     found = run_jobs([*jobs.values(), *own.values()], folder, workers, progress)
     scores = dict(zip([*jobs, *own], found, strict=True))
@@ -138,12 +121,12 @@ def run(
         _add_own(report, own, scores)
     _add_classes(report, known[0][0], counts, jobs, scores)
     _add_findings(report, curves)
-    whole = [name for name in persons if name not in divided]
+    whole = [name for name, group in persons.items() if len(group) < 2]
     if n_own and whole:
         report.findings.append(
             f"Not tested on a prior of their own, with one recording only: {', '.join(whole)}."
         )
-    report.findings += [*notes, *more_notes]
+    report.findings += notes
     title = "Persons never seen: error over the number of training persons"
     draw_picture(report, out, "learning-curve.png", lambda: plot_curves(curves, title))
     report.save(out)
@@ -196,6 +179,36 @@ def _imported(text: str) -> tuple[str, Recipe]:
     raise InputError(f"--compare {text}: expected NAME=module.function")
 
 
+class _Persons(NamedTuple):
+    """Holds recordings by person, of those who are tracked and of others, counts, and what is doubtful."""
+
+    persons: dict[str, list[Recording]]
+    others: dict[str, list[Recording]]
+    counts: tuple[int, ...]
+    notes: list[str]
+
+
+def _read(
+    data: Sequence[str | Path] | str | Path,
+    more: Sequence[str],
+    counts: tuple[int, ...],
+    quick: bool,
+) -> _Persons:
+    """Return the persons and the numbers of them that priors are fitted to, few for a quick run."""
+    folders, further, usual = _sources(data, more)
+    recordings, notes = read_known_persons(folders)
+    persons = by_person(recordings)
+    if len(persons) < 2:
+        raise InputError(f"a learning curve needs two persons or more, got {', '.join(persons)}")
+    counts = counts or usual or _doubling(len(persons) - 1)
+    if quick:
+        persons = {name: group[::5] for name, group in persons.items()}
+        counts = tuple(c for c in counts if c in counts[:2])
+    others, more_notes = _further_persons(further, len(persons) - 1, max(counts))
+    refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
+    return _Persons(persons, others, counts, [*notes, *more_notes])
+
+
 def _sources(
     data: Sequence[str | Path] | str | Path, more: Sequence[str]
 ) -> tuple[list[Path], list[Path], tuple[int, ...]]:
@@ -237,44 +250,52 @@ def _further_persons(
     return dict(list(others.items())[:missing]), notes
 
 
-def _curve_job(
+class _Fitting(NamedTuple):
+    """Holds how a recipe's priors are fitted and scored, as a `Job` takes it."""
+
+    settings: Mapping[str, Any]
+    recipe: Recipe
+    scoring: ScoreSettings
+
+
+def _curve_jobs(
     persons: Mapping[str, list[Recording]],
     others: Mapping[str, list[Recording]],
-    subset: Sequence[str],
-    count: int,
-    settings: Mapping[str, Any],
-    recipe: Recipe,
-    scoring: ScoreSettings,
-) -> Job:
-    further = list(others.values())[: max(0, count - len(subset))]
-    train = [r for name, group in persons.items() if name in subset for r in group]
-    train += [r for group in further for r in group]
-    tests = {name: group for name, group in persons.items() if name not in subset}
-    label = f"{count}: {' '.join(subset)}"
-    return Job(label, train, tests, settings, recipe, scoring)
+    counts: Sequence[int],
+    n_subsets: int,
+    fittings: Mapping[str, _Fitting],
+) -> dict[tuple[str, int, int], Job]:
+    """Return fits to some persons, scored on the rest, by recipe, number of persons and place."""
+    jobs = {}
+    for (recipe, fitting), count in product(fittings.items(), counts):
+        for i, subset in enumerate(cyclic_subsets(list(persons), count, n_subsets)):
+            further = list(others.values())[: max(0, count - len(subset))]
+            train = [r for name, group in persons.items() if name in subset for r in group]
+            train += [r for group in further for r in group]
+            tests = {name: group for name, group in persons.items() if name not in subset}
+            jobs[recipe, count, i] = Job(f"{count}: {' '.join(subset)}", train, tests, *fitting)
+    return jobs
 
 
 def _own_jobs(
-    persons: Mapping[str, list[Recording]],
-    person: str,
-    settings: Mapping[str, Any],
-    recipe: Recipe,
-    scoring: ScoreSettings,
-) -> dict[str, Job]:
-    """Return fits to a person's first half, of all others, and of both; scored on second halves.
+    persons: Mapping[str, list[Recording]], n_own: int, fittings: Mapping[str, _Fitting]
+) -> dict[tuple[str, str, str], Job]:
+    """Return fits to persons' first halves, of all others, and of both; scored on second halves.
 
     Persons with one recording have no second half, and are trained on only.
     """
-    first, _ = halves(persons[person])
-    mine = renamed(first, "first half")
-    rest = [r for name, group in persons.items() if name != person for r in group]
     later = {name: halves(group)[1] for name, group in persons.items() if len(group) > 1}
-    on = {person: later[person]}
-    return {
-        "one": Job(f"{person} alone", mine, later, settings, recipe, scoring),
-        "others": Job(f"all but {person}", rest, on, settings, recipe, scoring),
-        "both": Job(f"all, half of {person}", rest + mine, on, settings, recipe, scoring),
-    }
+    jobs: dict[tuple[str, str, str], Job] = {}
+    for (recipe, fitting), person in product(fittings.items(), list(later)[:n_own]):
+        mine = renamed(halves(persons[person])[0], "first half")
+        rest = [r for name, group in persons.items() if name != person for r in group]
+        on = {person: later[person]}
+        jobs |= {
+            (recipe, person, "one"): Job(f"{person} alone", mine, later, *fitting),
+            (recipe, person, "others"): Job(f"all but {person}", rest, on, *fitting),
+            (recipe, person, "both"): Job(f"all, half of {person}", rest + mine, on, *fitting),
+        }
+    return jobs
 
 
 # --- tables ---------------------------------------------------------------------------------------
