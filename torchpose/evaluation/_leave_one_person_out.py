@@ -85,19 +85,15 @@ def run(
     )  # fmt: skip
     scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
     thin = 5 if quick else 1
+    others = {
+        name: [r for other, group in persons.items() if other != name for r in group[::thin]]
+        for name in persons
+    }
     jobs = [
-        Job(
-            name,
-            [r for other, group in persons.items() if other != name for r in group[::thin]],
-            {name: group},
-            settings,
-            recipe,
-            scoring,
-        )
+        Job(name, others[name], {name: group}, settings, recipe, scoring)
         for name, group in persons.items()
     ]
-    folder = check_output_folder(fits or out)
-    found = run_jobs(jobs, folder, workers, progress)
+    found = run_jobs(jobs, check_output_folder(fits or out), workers, progress)
     scored = {name: result[name] for name, result in zip(persons, found, strict=True)}
     report = Report("Leave one person out", settings | {
         "quick": quick, "every": scoring.every, "recipe": recipe.__qualname__,
