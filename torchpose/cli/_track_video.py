@@ -61,8 +61,8 @@ def track_video(
     from torchpose.camera._choice import resolve_camera
     from torchpose.priors._upper_body_prior import load_prior
 
-    settings = job.settings
-    _refuse_options(job, options["detector"], face_model)
+    settings, detector = job.settings, options["detector"]
+    _refuse_options(job, detector, face_model)
     share_cores()
     prior = load_prior(settings.prior)
     pictures = pictures_possible(job.pictures)
@@ -77,27 +77,20 @@ def track_video(
             other = PictureProcess(pictures and source.reopenable and workers > 0)
             stack.enter_context(contextlib.closing(other))
             start = time.perf_counter()
-            if source.reopenable:
-                people, n_read = _track_recording(tracker, source, results.stage, workers)
-                n_frames = n_read
-            else:
-                people, n_read, n_frames = _track_camera(tracker, source, results.stage, overlay)
+            people, n_read, n_frames = (
+                _track_recording(tracker, source, results.stage, workers)
+                if source.reopenable
+                else _track_camera(tracker, source, results.stage, overlay)
+            )
             seconds = time.perf_counter() - start
         notes += tuple(source.notes)  # some of them are known once it is closed
-        if source.reopenable and options["detector"] is None:
+        if source.reopenable and detector is None:
             notes += _note_on_turn(source, people, n_frames)
         if not people:
-            detector = options["detector"]
             return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
         notes += _note_on_facts(settings, len(people))
-        method = f"{people[0].track.method}{smoothing_text(settings.smoothing)}"
-        facts = {
-            "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
-            "prior": prior.info.name or settings.prior,
-            "camera": camera_text(camera),
-            "method": f"{method}, {_measured_by(options)}",
-            "speed": f"{n_read / max(seconds, 1e-9):.0f} frames a second, without drawing",
-        }
+        rate = n_read / max(seconds, 1e-9)
+        facts = _facts(job, options, source, prior, camera, people[0].track.method, rate)
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         names = _names(people, source.reopenable)
         notes = _notes_of_all(people, names)
@@ -205,8 +198,8 @@ def _tracker(
 
 def _track_recording(
     tracker: "VideoTracker", source: "VideoSource", out: Path, workers: int
-) -> tuple[list["TrackedPerson"], int]:
-    """Return everybody in a file or folder and how many frames it had; Ctrl-C ends the recording."""
+) -> tuple[list["TrackedPerson"], int, int]:
+    """Return everybody in a file or folder, and twice how many frames it had; Ctrl-C ends the recording."""
     with UntilInterrupted(source) as frames:
         people = tracker(
             frames, show_progress(), n_frames=source.n_frames, folder=out, workers=workers
@@ -216,7 +209,7 @@ def _track_recording(
         source.notes.append(
             f"stopped by Ctrl-C after {frames.count}{of} frames: the rest was not tracked"
         )
-    return people, frames.count
+    return people, frames.count, frames.count
 
 
 def _track_camera(
@@ -399,11 +392,25 @@ def _write_report(
     return [*written, out / "report.html"]
 
 
-def _measured_by(options: dict[str, Any]) -> str:
-    """Return a phrase about the measurer, for the report."""
-    if options["detector"] is not None:
-        return f"keypoints by {options['detector']}"
-    return f"hands: {options['hands']}"
+def _facts(
+    job: TrackingJob,
+    options: dict[str, Any],
+    source: "VideoSource",
+    prior: "UpperBodyPrior",
+    camera: "PinholeCamera",
+    method: str,
+    rate: float,
+) -> dict[str, str]:
+    """Return what was tracked, and how, by the name of each fact; `rate` in frames a second."""
+    detector = options["detector"]
+    measured = f"hands: {options['hands']}" if detector is None else f"keypoints by {detector}"
+    return {
+        "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
+        "prior": prior.info.name or job.settings.prior,
+        "camera": camera_text(camera),
+        "method": f"{method}{smoothing_text(job.settings.smoothing)}, {measured}",
+        "speed": f"{rate:.0f} frames a second, without drawing",
+    }
 
 
 def _nobody(
