@@ -110,14 +110,7 @@ def track_keypoints(
         shown = list(inputs)
     overlay = job.overlay and shown is not None
     with ExitStack() as stack:
-        # videos that are named are read for their rate, also if nothing is drawn into them
-        wanted = (
-            overlay
-            or job.pictures
-            or settings.silhouettes is not None
-            or settings.videos is not None
-        )
-        films = stack.enter_context(_films(shown if wanted else None, cameras, settings))
+        films = stack.enter_context(_films(job, shown, cameras, settings))
         results = stack.enter_context(
             body_results(job, cameras, overlay, _further_files(job, shown is not None, settings))
         )
@@ -136,14 +129,9 @@ def track_keypoints(
         if not people:
             return report_nobody(_nobody(keypoints), results.folder)
         stage = results.stage
-        drawn: list[Path] = []
-        short: tuple[str, ...] = ()
         keypoints, cameras_file = _refined(keypoints, settings, people[0], stage)
         written = results.commit([*write_people(job, stage, people), *cameras_file])
-        if films is not None and (overlay or job.pictures):
-            drawn, short = draw(films.showing(keypoints), people, stage, overlay, job.pictures)
-        if job.pictures:
-            drawn += _write_skeletons(stage, people, cameras[0])
+        drawn, short = _drawn(job, people, films, keypoints, cameras[0], stage)
         facts = _facts(keypoints, settings, people, seconds)
         written += results.commit([*drawn, *write_page(cameras[0], people, facts, stage)])
     code = summary(people, facts, written, [*job.notes, *short, *results.notes])
@@ -154,10 +142,20 @@ def track_keypoints(
 
 
 def _films(
-    videos: list[str] | None, cameras: "Sequence[PinholeCamera]", settings: KeypointSettings
+    job: BodyJob,
+    videos: list[str] | None,
+    cameras: "Sequence[PinholeCamera]",
+    settings: KeypointSettings,
 ) -> AbstractContextManager[Films | None]:
-    """Return the videos into which the body is drawn, if there are some."""
-    return nullcontext() if videos is None else Films(videos, cameras, settings.delays)
+    """Return the videos into which the body is drawn, if there are some.
+
+    Videos that are named are read for their rate, also if nothing is drawn into them.
+    """
+    drawn = job.overlay or job.pictures
+    read = settings.silhouettes is not None or settings.videos is not None
+    if videos is None or not (drawn or read):
+        return nullcontext()
+    return Films(videos, cameras, settings.delays)
 
 
 def _recordings(
@@ -377,6 +375,24 @@ def _disagree(keypoints: BodyKeypoints, poses: "BodyTrack") -> bool:
     several = there.any(-1).sum(-1) >= 2
     apart = several & ((mean > _AGREES).sum(-1) < 2)
     return 2 * int(apart.sum()) > len(poses)
+
+
+def _drawn(
+    job: BodyJob,
+    people: "Sequence[BodyTrack]",
+    films: Films | None,
+    keypoints: BodyKeypoints,
+    camera: "PinholeCamera",
+    out: "Path",
+) -> tuple["list[Path]", tuple[str, ...]]:
+    """Draw what is wanted: bodies into videos, skeletons; return the files, and a note on short videos."""
+    drawn: list[Path] = []
+    short: tuple[str, ...] = ()
+    if films is not None and (job.overlay or job.pictures):
+        drawn, short = draw(films.showing(keypoints), people, out, job.overlay, job.pictures)
+    if job.pictures:
+        drawn += _write_skeletons(out, people, camera)
+    return drawn, short
 
 
 def _write_skeletons(
