@@ -94,17 +94,6 @@ def write_report(
     video = None if overlay is None else _Overlay(require_file(overlay), path)
     more += _thinning_notes([thinned for _, thinned in packed], fps)
     more += _failures(people, names) + ([] if video is None else video.notes)
-    joints = people[0].names if people else UPPER_BODY
-    data = {
-        "fps": fps,
-        "frames": n_frames,
-        "names": [readable(name) for name in joints],
-        "sides": [side_of(name) for name in joints],
-        "limbs": [list(pair) for pair in limbs],
-        "frame": people[0].frame if people else "camera",
-        "video": None if video is None else video.source,
-        "people": [person for person, _ in packed],
-    }
     parts = {
         "title": html.escape(title),
         "summary": html.escape(_summary(people, packed, n_frames, fps)),
@@ -112,8 +101,7 @@ def write_report(
         "script": "\n".join(_template(name) for name in _SCRIPTS),
         "facts": _facts(facts or {}),
         "notes": _list([*notes, *more]),
-        # no tag can begin inside of the data, whatever a name contains
-        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
+        "data": _data(people, packed, limbs, n_frames, fps, video),
     }
     with (
         atomic_path(path) as temporary,
@@ -156,6 +144,30 @@ def _fill(stream: TextIO, template: str, parts: dict[str, str], video: _Overlay 
             stream.writelines([] if video is None else video.base64())
         else:
             stream.write(parts[piece])
+
+
+def _data(
+    people: Sequence[ReportedTrack],
+    packed: Sequence[tuple[dict[str, Any], Thinned]],
+    limbs: Sequence[tuple[int, int]],
+    n_frames: int,
+    fps: float,
+    video: _Overlay | None,
+) -> str:
+    """Return the JSON of what the page's scripts show."""
+    joints = people[0].names if people else UPPER_BODY
+    data = {
+        "fps": fps,
+        "frames": n_frames,
+        "names": [readable(name) for name in joints],
+        "sides": [side_of(name) for name in joints],
+        "limbs": [list(pair) for pair in limbs],
+        "frame": people[0].frame if people else "camera",
+        "video": None if video is None else video.source,
+        "people": [person for person, _ in packed],
+    }
+    # no tag can begin inside of the data, whatever a name contains
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _template(name: str) -> str:
