@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torchpose._core.terminal import show_progress
 from torchpose.cli._common import save_pictures, share_cores
-from torchpose.cli._demo_keypoints import MEAN_POSE, beaten, report, score, score_mean_pose
+from torchpose.cli._demo_keypoints import MEAN_POSE, Scores, beaten, report, score, score_mean_pose
 from torchpose.cli._track_output import camera_text, track_pictures
 from torchpose.cli._track_video import write_overlay, write_people
 
@@ -47,10 +47,7 @@ def demo_video(
         print("torchpose: the demo failed: nobody was found in its video", file=sys.stderr)
         return 1
     person, n_frames = people[0], len(performance.joints)
-    tracks = {"filtered": person.track, "smoothed": _smoothed(tracker, person)}
-    truth = performance.joints[person.first_frame :][: len(person)]
-    scores = {name: score(track, truth) for name, track in tracks.items()}
-    scores[MEAN_POSE] = score_mean_pose(prior, truth)
+    scores = _scores(prior, tracker, person, performance)
     print(report(scores, "measured in the video: head and neck from the face, hands and elbows"))
     print(f"\n{_measured_shares(person)}; {n_frames / elapsed:.0f} frames a second, drawing apart")
     overlay = stage / "overlay.mp4"
@@ -76,6 +73,21 @@ def _render(clip: Path, performance: "Performance", seed: int) -> None:
 
     print(f"rendering {len(performance.joints)} frames ...", flush=True)
     render_video(clip, performance, demo_camera(), seed=seed)
+
+
+def _scores(
+    prior: "UpperBodyPrior",
+    tracker: "VideoTracker",
+    person: "TrackedPerson",
+    performance: "Performance",
+) -> dict[str, Scores]:
+    """Return the errors of the poses, filtered and smoothed, and of the mean pose of the prior."""
+    truth = performance.joints[person.first_frame :][: len(person)]
+    return {
+        "filtered": score(person.track, truth),
+        "smoothed": score(_smoothed(tracker, person), truth),
+        MEAN_POSE: score_mean_pose(prior, truth),
+    }
 
 
 def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
