@@ -171,20 +171,23 @@ class BodyTracker(OwnPrecisionModule):
                 "height does nothing beside body, whose bones tell it; leave one of them out"
             )
         given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
+        of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
         rig = as_rig(cameras)
         check_room(rig)
-        self.fps = float(fps)
-        self.notes: tuple[str, ...] = ()
-        settings = settings_of({
-            "fps": self.fps, "cameras": len(rig), "body": body, "height": height, "motion": motion, "up": up,
-            "n_particles": n_particles, "camera_height": camera_height, **given, **options,
-        })  # fmt: skip
-        self.by_keypoints: KeypointBodyTracker | None = None
         if method == KEYPOINT_METHOD:
             noise = {"process_cov": process_cov, "initial_cov": initial_cov}
             refuse([*given, *options, *given_of(noise)], f"for method {method}")
-            self.method = method
-            self._settings = (("method", method), *settings)
+        else:
+            refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
+            method = choose_method(method, given)
+        self.method, self.fps = method, float(fps)
+        self.notes: tuple[str, ...] = ()
+        self._settings = settings_of({
+            "method": method, "fps": self.fps, "cameras": len(rig), "body": body, "height": height,
+            "n_particles": n_particles, **of_kalman, **given, **options,
+        })  # fmt: skip
+        self.by_keypoints: KeypointBodyTracker | None = None
+        if method == KEYPOINT_METHOD:
             person = body if body is None or isinstance(body, Body) else load_body(body)
             self.cameras, self.n_particles = rig, 0
             self.by_keypoints = KeypointBodyTracker(
@@ -193,12 +196,8 @@ class BodyTracker(OwnPrecisionModule):
                 keypoint_std=keypoint_std, pixel_std=pixel_std, up=up, camera_height=camera_height,
             )  # fmt: skip
             return
-        of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
-        refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
-        self.method = choose_method(method, given)
-        self._settings = (("method", self.method), *settings)
         self._by_particles = set_up_particles(
-            self.method, rig, given, body, height, self.fps, n_particles,
+            method, rig, given, body, height, self.fps, n_particles,
             {**options, **given_of({"process_cov": process_cov})}, (keypoint_std, pixel_std),
         )  # fmt: skip
         self.filter, self.notes = self._by_particles.filter, self._by_particles.notes
