@@ -17,6 +17,8 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -88,11 +90,6 @@ def whole(report: Report, clip: Path, n_frames: int, setup: Setup, mediapipe: Pa
         with open_video(clip) as source:
             tracker(source, **options)
 
-    def decode() -> None:
-        with open_video(clip) as source:
-            for _ in source:
-                pass
-
     recorder, alone, camera = make_tracker(), make_tracker(), make_tracker()
     paper, parted = make_tracker(hands="mean-shift"), make_tracker(background=True)
     cases = [
@@ -105,13 +102,22 @@ def whole(report: Report, clip: Path, n_frames: int, setup: Setup, mediapipe: Pa
         ),
         Case("hands by mean shift (the paper)", lambda: track(paper), n_frames),
         Case("with the background model", lambda: track(parted), n_frames),
-        Case("decoding alone", decode, n_frames),
+        Case("decoding alone", lambda: decode(clip), n_frames),
     ]
     timings = take_turns(cases, setup.runs)
     rows = [row(timing) for timing in timings]
     if mediapipe is not None:
         rows.append(mediapipe_row(mediapipe, clip, setup))
     report.table(("", "frames/s", "ms a frame", "CPU ms a frame"), rows)
+
+
+def decode(clip: Path) -> None:
+    """Read all frames of a video."""
+    from torchpose.video import open_video
+
+    with open_video(clip) as source:
+        for _ in source:
+            pass
 
 
 def row(timing: Timing) -> tuple[str, ...]:
@@ -139,15 +145,38 @@ def mediapipe_row(python: Path, clip: Path, setup: Setup) -> tuple[str, ...]:
 
 def stages(report: Report, clip: Path, n_frames: int) -> None:
     """Time of each part, by the clock of its thread; without the parts within it that are listed too."""
-    from torchpose.measure import _hand_windows as windows
-    from torchpose.measure import _hands as module
     from torchpose.video import open_video
 
     tracker = make_tracker()
+    parts = parts_of(tracker)
+    with open_video(clip) as source, timed_parts(parts) as spent:
+        tracker(source)
+    start = time.thread_time()
+    decode(clip)
+    spent["decoding"] = time.thread_time() - start
+    every = dict.fromkeys(name for name, _, _ in parts if name != _REST)
+    of_hands = [name for name in every if name.startswith("-")] + [_REST]
+    order = ["decoding", *every]
+    place = order.index(of_hands[0])
+    order[place : place + len(of_hands) - 1] = ["hands: all", *of_hands]
+    total = sum(spent.values())
+    spent["hands: all"] = sum(spent.get(name, 0.0) for name in of_hands)
+    rows = [(name, f"{1e3 * spent.get(name, 0.0) / n_frames:.2f}") for name in order]
+    rows.append(("sum", f"{1e3 * total / n_frames:.2f}"))
+    report.table(("stage", "ms a frame"), rows)
+    report.add(
+        "Decoding, faces, and what images alone tell of hands run in one thread, the rest in another."
+    )
+
+
+def parts_of(tracker: Any) -> list[tuple[str, Any, str]]:
+    """Return the stages, in the order of the table: name, owner and method; some are several methods."""
+    from torchpose.measure import _hand_windows as windows
+    from torchpose.measure import _hands as module
+
     measurer = tracker.measurer
     hands = measurer.hand_tracker
-    spent: dict[str, float] = {}
-    parts = [
+    return [
         ("cuts to other scenes", measurer.scene_cuts, "step"),
         ("faces: detection and tracks", measurer, "_follow_faces"),
         (_REST, hands, "look"),
@@ -175,33 +204,20 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
         ("head and neck", measurer.head_neck, "forward"),
         ("poses, 32 frames at a time", tracker.tracker, "advance"),
     ]
+
+
+@contextmanager
+def timed_parts(parts: Sequence[tuple[str, Any, str]]) -> Iterator[dict[str, float]]:
+    """Time methods while a block runs; the seconds by name of the stage are complete after it."""
+    spent: dict[str, float] = {}
     kept = [(owner, method, getattr(owner, method)) for _, owner, method in parts]
     for name, owner, method in parts:
         object.__setattr__(owner, method, timed(getattr(owner, method), name, spent))
     try:
-        with open_video(clip) as source:
-            tracker(source)
+        yield spent
     finally:
         for owner, method, own in kept:
             object.__setattr__(owner, method, own)
-    start = time.thread_time()
-    with open_video(clip) as source:
-        for _ in source:
-            pass
-    spent["decoding"] = time.thread_time() - start
-    every = dict.fromkeys(name for name, _, _ in parts if name != _REST)
-    of_hands = [name for name in every if name.startswith("-")] + [_REST]
-    order = ["decoding", *every]
-    place = order.index(of_hands[0])
-    order[place : place + len(of_hands) - 1] = ["hands: all", *of_hands]
-    total = sum(spent.values())
-    spent["hands: all"] = sum(spent.get(name, 0.0) for name in of_hands)
-    rows = [(name, f"{1e3 * spent.get(name, 0.0) / n_frames:.2f}") for name in order]
-    rows.append(("sum", f"{1e3 * total / n_frames:.2f}"))
-    report.table(("stage", "ms a frame"), rows)
-    report.add(
-        "Decoding, faces, and what images alone tell of hands run in one thread, the rest in another."
-    )
 
 
 def timed(call: Any, name: str, spent: dict[str, float]) -> Any:
