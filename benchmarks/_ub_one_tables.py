@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool
@@ -26,6 +27,7 @@ SUMMARY = (
 SAMPLED = ("mkf-sampled", "pf-walk", "pf-walk-unscaled", "pf-mixture")
 FIXED, DRAWN, SPLIT = "MKF fixed tracks", "MKF sampled", "split tracks"
 WALK, SCALED, MIXTURE = "PF walk, no scaling", "PF walk, scaled", "PF mixture"
+_PARTICLES = (WALK, SCALED, MIXTURE)
 _PAPER_SECONDS = {FIXED: 15, DRAWN: 21, WALK: 28, SCALED: 46, MIXTURE: 2947}
 _SHOWN_SECONDS = 15.0  # more would be a thicket
 Runs = Mapping[str, Sequence[Scores]]
@@ -121,82 +123,100 @@ def _behaviour(scores: Scores, raised: Bool[Tensor, "T 2"]) -> list[float]:
     ]
 
 
-def add_findings(
-    report: Report, scores: Runs, times: Mapping[str, float], raised: Bool[Tensor, "T 2"]
-) -> None:
+class _Claim(NamedTuple):
+    """Holds what the paper says, whether it holds in these numbers, and the numbers."""
+
+    text: str
+    holds: bool
+    numbers: str
+
+
+def add_findings(report: Report, times: Mapping[str, float], raised: Bool[Tensor, "T 2"]) -> None:
     """Add findings: which claims of the paper's section 4 hold in these numbers."""
-    pixels, behaviour = report["errors_2d"], report["behaviour"]
+    claims = [
+        *_claims_on_pixels(report),
+        *_claims_on_behaviour(report, raised),
+        _claim_on_time(times),
+    ]
+    report.findings += [
+        f"{text}: {'yes' if holds else 'no'} ({numbers})." for text, holds, numbers in claims
+    ]
 
-    def px(name: str) -> float:
-        return float(pixels[name, "mean"])
 
-    def says(claim: str, holds: bool, numbers: str) -> None:
-        report.findings.append(f"{claim}: {'yes' if holds else 'no'} ({numbers}).")
-
-    def listed(names: Sequence[str], value: Callable[[str], float], unit: str) -> str:
-        return ", ".join(f"{n} {value(n):.1f}" for n in names) + f" {unit}"
-
-    def column(name: str) -> Callable[[str], float]:
-        return lambda row: float(behaviour[row, name])
-
-    filters = (WALK, SCALED, MIXTURE)
-    says(
+def _claims_on_pixels(report: Report) -> Iterator[_Claim]:
+    px = _column(report["errors_2d"], "mean")
+    narrow = "PF mixture, Q of the MKF"
+    yield _Claim(
         "The mixture Kalman filters are ahead of all particle filters",
-        max(px(FIXED), px(DRAWN)) < min(map(px, filters)),
-        listed((FIXED, DRAWN, SPLIT, *filters), px, "pixels"),
+        max(px(FIXED), px(DRAWN)) < min(map(px, _PARTICLES)),
+        _listed((FIXED, DRAWN, SPLIT, *_PARTICLES), px, "pixels"),
     )
-    says(
+    yield _Claim(
         "The unscaled random walk is the best particle filter",
-        px(WALK) == min(map(px, filters)),
-        listed(filters, px, "pixels"),
+        px(WALK) == min(map(px, _PARTICLES)),
+        _listed(_PARTICLES, px, "pixels"),
     )
-    says(
+    yield _Claim(
         "The scaled random walk tracks poorly (over 1.5 times the unscaled one's error)",
         px(SCALED) > 1.5 * px(WALK),
-        listed((SCALED, WALK), px, "pixels"),
+        _listed((SCALED, WALK), px, "pixels"),
     )
-    says(
+    yield _Claim(
         "The mixture proposal, with its larger Q and no burn-in, comes last",
-        px(MIXTURE) == max(map(px, filters)),
-        listed(filters, px, "pixels"),
+        px(MIXTURE) == max(map(px, _PARTICLES)),
+        _listed(_PARTICLES, px, "pixels"),
     )
-    tail = column("99th percentile")
-    narrow = "PF mixture, Q of the MKF"
-    says(
+    yield _Claim(
         "The mixture proposal needs a larger Q than the Kalman filters, or it loses the joints",
         px(narrow) > 1.5 * px(MIXTURE),
-        listed((MIXTURE, narrow), px, "pixels"),
+        _listed((MIXTURE, narrow), px, "pixels"),
     )
-    says(
+
+
+def _claims_on_behaviour(report: Report, raised: Bool[Tensor, "T 2"]) -> Iterator[_Claim]:
+    table = report["behaviour"]
+    tail = _column(table, "99th percentile")
+    yield _Claim(
         "Particle filters have error spikes that the mixture Kalman filters have not",
-        min(map(tail, filters)) > max(tail(FIXED), tail(DRAWN)),
-        "99th percentile of the 3D error: " + listed((FIXED, DRAWN, *filters), tail, "cm"),
+        min(map(tail, _PARTICLES)) > max(tail(FIXED), tail(DRAWN)),
+        "99th percentile of the 3D error: " + _listed((FIXED, DRAWN, *_PARTICLES), tail, "cm"),
     )
-    shake = column("jitter (m/s2)")
-    says(
+    shake = _column(table, "jitter (m/s2)")
+    yield _Claim(
         "Fixed tracks are smoother than sampled ones",
         shake(FIXED) < shake(DRAWN),
-        "jitter: " + listed((FIXED, DRAWN, SPLIT), shake, "m/s2"),
+        "jitter: " + _listed((FIXED, DRAWN, SPLIT), shake, "m/s2"),
     )
     if bool(raised.any()):
-        up = column("arm raised")
-        says(
+        up = _column(table, "arm raised")
+        yield _Claim(
             "Fixed tracks are better on raised arms than sampled ones",
             up(FIXED) < up(DRAWN),
-            f"hand and elbow, {int(raised.sum())} arm-frames: " + listed((FIXED, DRAWN), up, "cm"),
+            f"hand and elbow, {int(raised.sum())} arm-frames: " + _listed((FIXED, DRAWN), up, "cm"),
         )
-    near = column("hands < 20 cm (%)")
-    says(
+    near = _column(table, "hands < 20 cm (%)")
+    yield _Claim(
         "For much of the time the error in hand position is below 20 cm",
         near(FIXED) > 50,
-        "share of the frames: " + listed((FIXED, DRAWN, *filters), near, "%"),
+        "share of the frames: " + _listed((FIXED, DRAWN, *_PARTICLES), near, "%"),
     )
-    says(
+
+
+def _claim_on_time(times: Mapping[str, float]) -> _Claim:
+    fast = max(times[FIXED], times[DRAWN]) < min(times[name] for name in _PARTICLES)
+    return _Claim(
         "The mixture proposal is the slowest, and both mixture Kalman filters are the fastest",
-        times[MIXTURE] == max(times.values())
-        and max(times[FIXED], times[DRAWN]) < min(times[n] for n in filters),
-        listed((FIXED, DRAWN, *filters), lambda n: times[n], "ms"),
+        times[MIXTURE] == max(times.values()) and fast,
+        _listed((FIXED, DRAWN, *_PARTICLES), times.__getitem__, "ms"),
     )
+
+
+def _column(table: Table, name: str) -> Callable[[str], float]:
+    return lambda row: float(table[row, name])
+
+
+def _listed(names: Sequence[str], value: Callable[[str], float], unit: str) -> str:
+    return ", ".join(f"{name} {value(name):.1f}" for name in names) + f" {unit}"
 
 
 def add_pictures(

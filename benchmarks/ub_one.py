@@ -144,7 +144,7 @@ def run(
     fill_summary(
         summary, report, noise, f"{particles:,} particles, {prior.n_components} components"
     )
-    add_findings(report, scores, times, raised)
+    add_findings(report, times, raised)
     add_pictures(
         report, out, {n: s[0] for n, s in scores.items() if n in TRACKERS}, test.fps, plain
     )
