@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._upper_body import plain_prior
-from torchpose.evaluation import Report
+from torchpose.evaluation._report import Report, Table
 from torchpose.evaluation._trials import (
     CAMERA,
     MEASURED,
@@ -70,9 +70,36 @@ def add_gap_tables(
     wanted = round(_DURATION * fps)
     test = make_test_set([poses[i][back_and_forth(len(poses[i]), wanted)] for i in chosen], CAMERA,
                          fps, seed)  # fmt: skip
-    table = report.table(
+    table, jumps = _tables(report, len(chosen))
+    curves: dict[str, Tensor] = {}
+    lengths = GAPS[:1] if quick else GAPS
+    shown = lengths[:2][-1]  # the second, if there is one
+    runs = _models(prior)
+    bar = tqdm(total=len(runs) * (1 + 2 * len(lengths)), disable=not progress, desc="gaps")
+    for name, (own, options) in runs.items():
+        whole = {frame: track(own, CAMERA, test, frame=frame, **options)
+                 for frame in ("camera", "body")}  # fmt: skip
+        bar.update()
+        for seconds in lengths:
+            parts = []
+            for side in _ARMS:
+                parts.append(_one_gap(own, test, whole, side, seconds, options))
+                bar.update()
+            rows = torch.stack([torch.tensor(values) for values, _, _ in parts])
+            table.add(f"{name}, {seconds:g} s", rows.mean(0).tolist())
+            worst = torch.stack([torch.tensor(values) for _, values, _ in parts]).amax(0)
+            jumps.add(f"{name}, {seconds:g} s", worst.tolist())
+            if seconds == shown:
+                curves[name] = torch.stack([errors for _, _, errors in parts]).mean(0)
+    bar.close()
+    _picture(report, out, curves, fps, shown)
+
+
+def _tables(report: Report, n_sequences: int) -> tuple[Table, Table]:
+    """Return the empty tables of errors about gaps, and of jumps of the other arm."""
+    gaps = report.table(
         "gaps",
-        f"One hand hidden in {len(chosen)} sequences of 8 s (cm; inside the 50 % and 90 % "
+        f"One hand hidden in {n_sequences} sequences of 8 s (cm; inside the 50 % and 90 % "
         "ellipsoids, %)",
         ["hand before", "hand during", "elbow during", "hand 1 s after", "elbow 1 s after",
          "hand 50 %", "hand 90 %", "elbow 50 %", "elbow 90 %"],
@@ -95,28 +122,7 @@ def add_gap_tables(
         "camera axes they share the estimated rotation and place of the camera. Windows hold the "
         "other hand as well. 'median' is over sequences.",
     )
-    curves: dict[str, Tensor] = {}
-    lengths = GAPS[:1] if quick else GAPS
-    runs = _models(prior)
-    bar = tqdm(total=len(runs) * (1 + 2 * len(lengths)), disable=not progress, desc="gaps")
-    for name, (own, options) in runs.items():
-        whole = {frame: track(own, CAMERA, test, frame=frame, **options)
-                 for frame in ("camera", "body")}  # fmt: skip
-        bar.update()
-        for seconds in lengths:
-            parts = []
-            for side in _ARMS:
-                parts.append(_one_gap(own, test, whole, side, seconds, options))
-                bar.update()
-            rows = torch.stack([torch.tensor(values) for values, _, _ in parts])
-            table.add(f"{name}, {seconds:g} s", rows.mean(0).tolist())
-            worst = torch.stack([torch.tensor(values) for _, values, _ in parts]).amax(0)
-            jumps.add(f"{name}, {seconds:g} s", worst.tolist())
-            if seconds == lengths[min(1, len(lengths) - 1)] and len(curves) < 6:
-                curves[name] = torch.stack([errors for _, _, errors in parts]).mean(0)
-                shown = seconds
-    bar.close()
-    _picture(report, out, curves, fps, shown)
+    return gaps, jumps
 
 
 def _models(prior: UpperBodyPrior) -> dict[str, tuple[UpperBodyPrior, dict[str, Any]]]:
