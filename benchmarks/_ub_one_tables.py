@@ -41,6 +41,25 @@ def add_tables(
     raised: Bool[Tensor, "T 2"],
 ) -> None:
     """Add errors, correct limbs, spikes and smoothness, time."""
+    _add_errors(report, scores)
+    _add_behaviour(report, scores, test, raised)
+    curves = {name: torch.stack([s.limbs.per_limb for s in runs]) for name, runs in scores.items()}
+    add_pcp_table(
+        report,
+        {name: scores[name][0].limbs._replace(per_limb=c.mean(0)) for name, c in curves.items()},
+    )
+    table = report.table(
+        "time",
+        "Time of one iteration of one arm (ms)",
+        ["median", "paper's Table 1"],
+        digits=(2, 0),
+        note=f"Online steps of one sequence, {torch.get_num_threads()} threads.",
+    )
+    for name, milliseconds in times.items():
+        table.add(name, [milliseconds, _PAPER_SECONDS.get(name)])
+
+
+def _add_errors(report: Report, scores: Runs) -> None:
     for key, title, field, scale in (
         ("errors_2d", "2D error (pixels; mean over seeds, and its spread)", "errors2d", 1.0),
         ("errors_3d", "3D error after Procrustes (cm; mean over seeds, and its spread)",
@@ -54,6 +73,9 @@ def add_tables(
             spread = float(means.std()) if len(means) > 1 else float("nan")
             joints = torch.stack([v.flatten(0, 1).nanmean(0) for v in values]).mean(0)
             table.add(name, [float(means.mean()), spread, *joints.tolist()])
+
+
+def _add_behaviour(report: Report, scores: Runs, test: Trials, raised: Bool[Tensor, "T 2"]) -> None:
     table = report.table(
         "behaviour",
         "Spikes, smoothness and raised arms (3D errors in cm)",
@@ -70,20 +92,6 @@ def add_tables(
         f"({int(raised.sum())} of {raised.numel()} arm-frames). Percentile and largest are over all "
         "joints. Lost frames have no estimate and are not in the other numbers."
     )
-    curves = {name: torch.stack([s.limbs.per_limb for s in runs]) for name, runs in scores.items()}
-    add_pcp_table(
-        report,
-        {name: scores[name][0].limbs._replace(per_limb=c.mean(0)) for name, c in curves.items()},
-    )
-    table = report.table(
-        "time",
-        "Time of one iteration of one arm (ms)",
-        ["median", "paper's Table 1"],
-        digits=(2, 0),
-        note=f"Online steps of one sequence, {torch.get_num_threads()} threads.",
-    )
-    for name, milliseconds in times.items():
-        table.add(name, [milliseconds, _PAPER_SECONDS.get(name)])
 
 
 def fill_summary(table: Table, report: Report, noise: Mapping[str, str], title: str) -> None:
