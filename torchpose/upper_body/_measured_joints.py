@@ -72,6 +72,8 @@ class MeasuredJoints(NamedTuple):
         confidence: the confidence of the detector, [B, T, 8], 1 where missing; None where it gives none.
         absence: the evidence that missing hands are outside of the image; None without any.
         body: all keypoints of the whole body, None where shoulders or elbows are not among them.
+        bridged: the variance, metres squared, by which joints may be off whose keypoints were put into gaps
+            (`bridged_over_gaps`), [B, T, 8], 0 of those that are measured; None without any.
     """
 
     uv: Tensor
@@ -82,6 +84,7 @@ class MeasuredJoints(NamedTuple):
     confidence: Tensor | None = None
     absence: Absence | None = None
     body: BodyPoints | None = None
+    bridged: Tensor | None = None
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:

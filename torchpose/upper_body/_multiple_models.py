@@ -250,7 +250,10 @@ def _log_ratios(
 ) -> Float[Tensor, "B T 2"]:
     """Return the log-likelihood ratio of windows to bones for both arms, and 1 where a limb is measured."""
     ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (seen, bodies))
-    some = (measured.mask[..., ELBOWS] | measured.mask[..., HANDS]).any(-1)
+    known = measured.mask
+    if measured.bridged is not None:
+        known = known & (measured.bridged == 0)
+    some = (known[..., ELBOWS] | known[..., HANDS]).any(-1)
     apart = torch.where(some, (ours - theirs).nan_to_num(0.0), 0.0)
     return torch.stack([apart, some.to(apart)], -1)
 

@@ -71,7 +71,8 @@ class PoseTrack:
         observed: [B, T, 8], True where the joint was measured, False where it was inferred because no
             keypoint was given or it was an outlier.
         log_evidence: [B, T, 2], the increments log p(z_t | z_1:t-1) of the left and of the right arm.
-            Both arms contain head and neck, so their sum is a score and not an evidence.
+            Both arms contain head and neck, so their sum is a score and not an evidence. With smoothing
+            over all frames, keypoints that were put into gaps count as measured.
         lengths: [B], the number of frames of each sequence.
         matrix: the camera matrix K [3, 3] of the input.
         failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
@@ -33,7 +33,7 @@ from torchpose.upper_body._fusion import (
     read_out,
     recalibrated,
 )
-from torchpose.upper_body._measured_joints import kept_pixel_maps, kept_turn
+from torchpose.upper_body._measured_joints import MeasuredJoints, kept_pixel_maps, kept_turn
 from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._screening import Screened
@@ -74,6 +74,7 @@ class PoseReader(NamedTuple):
         estimates: Estimates,
         found: Screened,
         lengths: Int[Tensor, " B"] | None = None,
+        used: MeasuredJoints | None = None,
     ) -> tuple[MotionStageState | None, PoseTrack]:
         """Return the next state of the motion stage, and the poses of T more frames.
 
@@ -82,13 +83,15 @@ class PoseReader(NamedTuple):
             estimates: the estimates of both arms, [B, T, ...]. found: the measurements they were made from.
             lengths: of whole sequences, the number of frames of each, [B]; past it the last pose is
                 repeated. None is T.
+            used: the measurements with keypoints in gaps too (`bridged_over_gaps`); None without these.
         """
         matrix, poses = self.prior.info.matrix_like(estimates.left.mean), estimates.poses
         if poses is None:
             reading = read_out(estimates, matrix, self.order)
             motion, reading = self._steadied(motion, reading, estimates, lengths)
             poses = in_camera_axes(reading, self.order)
-        poses = self._tilted(self._placed(poses, matrix, found.measured.mask), matrix)
+        poses = self._placed(poses, matrix, found.measured if used is None else used)
+        poses = self._tilted(poses, matrix)
         notes = self.notes + outlier_notes(found.probability, found.exchanged, lengths)
         if lengths is None:
             lengths = torch.full((len(poses.uv),), poses.uv.shape[1], device=poses.uv.device)
@@ -152,14 +155,16 @@ class PoseReader(NamedTuple):
         )
 
     def _placed(
-        self, poses: SeenPoses, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
+        self, poses: SeenPoses, matrix: Float[Tensor, "3 3"], measured: MeasuredJoints
     ) -> SeenPoses:
         """Return the poses with calibrated covariances, in the frame that was asked for."""
         if self.estimator.reads_rays:
-            poses = on_their_rays(poses, matrix, observed)
+            poses = on_their_rays(poses, matrix, measured.mask)
         if self.calibrated:
             mode = self.estimator.calibration or calibration_mode(self.method)
             poses = poses._replace(covs=recalibrated(poses.covs, self.prior.noise, mode))
+        if measured.bridged is not None:
+            poses = _less_sure(poses, matrix, measured.bridged)
         if self.frame == "body":
             return in_body_axes(poses)
         return put_at(poses, self.prior.left.moments()[0][18:]) if self.static_camera else poses
@@ -181,6 +186,22 @@ class PoseReader(NamedTuple):
             rotations=rotation @ poses.rotations,
             place=poses.place @ rotation.mT,
         )
+
+
+def _less_sure(
+    poses: SeenPoses, matrix: Float[Tensor, "3 3"], variance: Float[Tensor, "B T 8"]
+) -> SeenPoses:
+    """Return poses with more variance of joints along every axis, in space and in the image.
+
+    Args:
+        poses: in the camera's axes. matrix: K of the prior's camera. variance: metres squared.
+    """
+    eye = torch.eye(3).to(poses.covs)
+    scale = matrix.diagonal()[:2] / poses.joints[..., 2:].clamp_min(_NEAREST)
+    return poses._replace(
+        covs=poses.covs + variance[..., None, None] * eye,
+        uv_covs=poses.uv_covs + torch.diag_embed(variance[..., None] * scale.square()),
+    )
 
 
 def _bone_fields(bones: Bones | None) -> dict[str, Any]:
@@ -206,6 +227,7 @@ def check_frame(frame: str, static_camera: bool) -> None:
         raise InputError("static_camera needs frame='camera': the body's axes know no camera")
 
 
+_NEAREST = 0.1  # metres before the camera, from where a projection means something
 _FEW = 2.0  # particles: below that, one of them has most of the weight
 # Share of the frames of an arm with so few, above which it is said: quick movements alone have fewer.
 _COLLAPSED_SHARE = 0.25

@@ -34,6 +34,7 @@ from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import NECK_KINDS
 from torchpose.upper_body._absence import HANDS, absence_of
+from torchpose.upper_body._bridged_gaps import bridged_over_gaps
 from torchpose.upper_body._estimator import (
     Estimator,
     TrackerModel,
@@ -123,7 +124,8 @@ class UpperBodyTracker(WideModule):
             the prior.
         smoothing: the number of later frames that an estimate may use, "full" for all of them, None or 0 for
             none; only for "multiple-model", "articulated", "window-mixture" and "mkf-fixed". Windows then
-            look a few frames ahead.
+            look a few frames ahead. With all of them, keypoints are put into gaps of up to two seconds, on
+            the way between both ends; `PoseTrack.observed` is False there, and covariances are larger.
         frame: the axes of the 3D poses: "camera", or "body" for those of the prior's recordings.
         static_camera: whether the body is put in front of a camera that stays at the prior's mean place,
             turned by the estimated rotation, as the authors' released demo does.
@@ -302,11 +304,12 @@ class UpperBodyTracker(WideModule):
             there = given.mask.flatten(0, 1).any(0).tolist()
             reader = self._reader(there, picked, cov)
             _, found = screen_joints(self._screen(picked, cov), None, given)
+            used = found.measured
+            if self._sees_all(keypoints.shape[1]):
+                used = bridged_over_gaps(used, lengths, self.fps or 30.0)
             arms = generators_of_arms(generator)
-            estimates = reader.estimator.forward(
-                found.measured, arm_joints(there), arms, lengths, progress
-            )
-            _, track = reader.read(None, estimates, found, lengths)
+            estimates = reader.estimator.forward(used, arm_joints(there), arms, lengths, progress)
+            _, track = reader.read(None, estimates, found, lengths, used)
         return note_collapse(track.in_precision(self.dtype))
 
     if TYPE_CHECKING:  # nn.Module has Any
@@ -454,6 +457,12 @@ class UpperBodyTracker(WideModule):
         return settings_of(
             {"prior": self.prior.info.name, **own, "neck": self.neck, **self.options}
         )
+
+    def _sees_all(self, n_frames: int) -> bool:
+        """Return whether every estimate of a sequence may use all of its frames."""
+        if isinstance(self.smoothing, int):
+            return self.smoothing >= n_frames - 1
+        return self.smoothing is not None
 
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
         """Return the notes about the choice of the method and about the kinds of neck and hands."""
