@@ -11,6 +11,7 @@ from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._bridged_gaps import bridged_over_gaps
 from torchpose.upper_body._estimator import Estimates
+from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._lifted_arms import BodyPoints
 from torchpose.upper_body._measured_joints import MeasuredJoints, MiddlePoint
 from torchpose.upper_body._multiple_models import _log_ratios
@@ -86,13 +87,14 @@ def test_hands_that_are_rather_outside_of_the_image_stay_missing():
     assert bool(found.mask[0, :, ELBOW].all()) and float(found.bridged[0, 13, HAND]) == 0.0
 
 
-def test_the_middle_of_the_shoulders_and_the_keypoints_of_the_network_are_bridged_too():
+def test_the_middle_of_the_shoulders_the_face_and_the_keypoints_of_the_network_are_bridged_too():
     measured, uv = seen(hidden=[(HAND, 10, 10)])
     there = torch.ones(1, 30, dtype=torch.bool)
     there[0, 10] = False
     middle = MiddlePoint(uv[:, :, 3] * there[..., None], there, measured.cov[:, :, 3])
     body = BodyPoints(uv[:, :, :1] * there[..., None, None], there[..., None].double())
-    found = bridged_over_gaps(measured._replace(middle=middle, body=body), None, RATE)
+    face = FacePoints(*body, torch.tensor([True]))
+    found = bridged_over_gaps(measured._replace(middle=middle, body=body, face=face), None, RATE)
     halfway = (uv[0, 9] + uv[0, 11]) / 2
     torch.testing.assert_close(found.middle.uv[0, 10], halfway[3])
     torch.testing.assert_close(found.middle.cov[0, 10], 9 * measured.cov[0, 10, 3])

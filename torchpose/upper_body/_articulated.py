@@ -521,7 +521,7 @@ class ArticulatedFilter(Estimator):
                 self.neck_between,
             ),
             shoulders=seen.frame.torso[:, :2],
-            limbs=seen.frame.limbs,
+            limbs=seen.frame.seen,
             whole=seen.facts.whole,
             lost=(False, False) in seen.facts.patterns,
             exact=seen.frame.exact,

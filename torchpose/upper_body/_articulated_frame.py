@@ -68,6 +68,7 @@ class RayFrame(NamedTuple):
             beyond them, [B]. It is where hands are the only limbs, since elbows are sharper than a trend. A
             torso of one joint has no size in the image, and arms alone are a poor witness of how far it is.
         face: the confidence of nose, eyes and ears, [B, 5]; None if there are none.
+        seen: as limbs, but those that were put into gaps not, [B, 2, 2].
         log_inside: see `Absence`, 0 where a hand is measured, [B, 2]; None without any evidence.
         told: k of lifted bones (`LiftedBones`), [B, 5]; None without any.
     """
@@ -84,6 +85,7 @@ class RayFrame(NamedTuple):
     stiff: Tensor
     extrapolates: Tensor
     face: Tensor | None
+    seen: Tensor
     log_inside: Tensor | None = None
     told: Tensor | None = None
 
@@ -174,10 +176,14 @@ def as_rays(measured: MeasuredJoints, optics: Optics, bones: LiftedBones | None 
         parts.append(pad(places, (0, 1)))
     there = known.index_select(-1, rows)
     torso, limbs = there[..., _TORSO], there[..., _LIMBS].unflatten(-1, (2, 2))
+    seen = limbs
+    if measured.bridged is not None:
+        bridged = measured.bridged.index_select(-1, rows[_LIMBS]).unflatten(-1, (2, 2))
+        seen = limbs & (bridged == 0)
     return RayFrame(
         torch.cat(parts, -2), known, std, exact, torso, std.index_select(-1, rows[_TORSO]), lifted,
         limbs, *_noise_along(std, known), (torso.sum(-1) > 1) & ~limbs[..., 0].any(-1),
-        None if face is None else face.confidence, _log_inside(measured),
+        None if face is None else face.confidence, seen, _log_inside(measured),
         None if bones is None else bones.precision,
     )  # fmt: skip
 

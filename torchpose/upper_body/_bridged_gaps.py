@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,12 +10,13 @@ from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
+from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._lifted_arms import BodyPoints
 from torchpose.upper_body._measured_joints import MeasuredJoints, MiddlePoint
 
 _LONGEST = 2.0  # seconds between the measurements before and after a gap
 _NOISE = 9.0  # factor on R of keypoints in gaps
-_SURE = 0.5  # confidence of these, for the network that lifts bones
+_SURE = 0.5  # confidence of these, of the face and for the network that lifts bones
 # Metres per second^1.5 along every axis: how far hands and elbows are from the line of their arm, others
 # from the straight line.
 _HAND_MOVES, _ELBOW_MOVES, _OTHERS_MOVE = 1.2, 0.7, 0.25
@@ -74,13 +75,14 @@ def bridged_over_gaps(
     if not bool(gaps.inside.any()):
         return measured
     cov = measured.cov.expand(*gaps.inside.shape, 2, 2)
-    middle, body = measured.middle, measured.body
+    middle, body, face = measured.middle, measured.body, measured.face
     return measured._replace(
         uv=_bridged_places(measured, gaps),
         mask=measured.mask | gaps.inside,
         cov=torch.where(gaps.inside[..., None, None], _NOISE * _on_the_way(cov, gaps), cov),
         middle=None if middle is None else _bridged_middle(middle, inside[..., 0], rate),
-        body=None if body is None else _bridged_body(body, inside, rate),
+        body=None if body is None else _bridged_points(body, inside, rate),
+        face=None if face is None else _bridged_points(face, inside, rate),
         bridged=(_moves(measured.uv) * gaps.time).square() * gaps.inside,
     )
 
@@ -138,12 +140,15 @@ def _bridged_middle(middle: MiddlePoint, inside: Bool[Tensor, "B T"], rate: floa
     return MiddlePoint(places[:, :, 0], middle.mask | missing[..., 0], covs[:, :, 0])
 
 
-def _bridged_body(body: BodyPoints, inside: Bool[Tensor, "B T 1"], rate: float) -> BodyPoints:
-    """Return the keypoints of the whole body, in gaps too, at half of full confidence."""
-    gaps = _find_gaps((body.confidence > 0) & inside, rate)
+_Points = TypeVar("_Points", BodyPoints, FacePoints)
+
+
+def _bridged_points(points: _Points, inside: Bool[Tensor, "B T 1"], rate: float) -> _Points:
+    """Return the keypoints of the whole body, or of the face, in gaps too."""
+    gaps = _find_gaps((points.confidence > 0) & inside, rate)
     missing = gaps.inside
-    places = torch.where(missing[..., None], _on_the_way(body.places, gaps), body.places)
-    return BodyPoints(places, body.confidence.masked_fill(missing, _SURE))
+    places = torch.where(missing[..., None], _on_the_way(points.places, gaps), points.places)
+    return points._replace(places=places, confidence=points.confidence.masked_fill(missing, _SURE))
 
 
 def _moves(like: Tensor) -> Float[Tensor, " 8"]:
