@@ -176,10 +176,7 @@ def as_rays(measured: MeasuredJoints, optics: Optics, bones: LiftedBones | None 
         parts.append(pad(places, (0, 1)))
     there = known.index_select(-1, rows)
     torso, limbs = there[..., _TORSO], there[..., _LIMBS].unflatten(-1, (2, 2))
-    seen = limbs
-    if measured.bridged is not None:
-        bridged = measured.bridged.index_select(-1, rows[_LIMBS]).unflatten(-1, (2, 2))
-        seen = limbs & (bridged == 0)
+    seen = measured.seen.index_select(-1, rows[_LIMBS]).unflatten(-1, (2, 2))
     return RayFrame(
         torch.cat(parts, -2), known, std, exact, torso, std.index_select(-1, rows[_TORSO]), lifted,
         limbs, *_noise_along(std, known), (torso.sum(-1) > 1) & ~limbs[..., 0].any(-1),

@@ -79,7 +79,7 @@ def bridged_over_gaps(
     return measured._replace(
         uv=_bridged_places(measured, gaps),
         mask=measured.mask | gaps.inside,
-        cov=torch.where(gaps.inside[..., None, None], _NOISE * _on_the_way(cov, gaps), cov),
+        cov=_filled(cov, gaps, _NOISE),
         middle=None if middle is None else _bridged_middle(middle, inside[..., 0], rate),
         body=None if body is None else _bridged_points(body, inside, rate),
         face=None if face is None else _bridged_points(face, inside, rate),
@@ -116,16 +116,21 @@ def _on_the_way(values: Float[Tensor, "B T J *rest"], gaps: _Gaps) -> Float[Tens
     return first.lerp(second, gaps.share.to(values).view(shape))
 
 
+def _filled(
+    values: Float[Tensor, "B T J *rest"], gaps: _Gaps, factor: float = 1.0
+) -> Float[Tensor, "B T J *rest"]:
+    """Return values with those in gaps on the way between both ends, times a factor."""
+    inside = gaps.inside.view(*gaps.inside.shape, *[1] * (values.ndim - 3))
+    return torch.where(inside, factor * _on_the_way(values, gaps), values)
+
+
 def _bridged_places(measured: MeasuredJoints, gaps: _Gaps) -> Float[Tensor, "B T 8 2"]:
     """Return the keypoints, with those in gaps relative to the joint from which their bone starts."""
-    missing = gaps.inside[..., None]
-    places = torch.where(missing, _on_the_way(measured.uv, gaps), measured.uv)
-    known = measured.mask | gaps.inside
+    places, known = _filled(measured.uv, gaps), measured.mask | gaps.inside
     for near, far in ((SHOULDERS, ELBOWS), (ELBOWS, HANDS)):
         start = places[..., near, :].where(known[..., near, None], torch.nan)
-        bones = _on_the_way(places[..., far, :] - start, gaps.of(far))
-        ends = start + bones
-        there = missing[..., far, :] & ends.isfinite()
+        ends = start + _on_the_way(places[..., far, :] - start, gaps.of(far))
+        there = gaps.inside[..., far, None] & ends.isfinite()
         places[..., far, :] = torch.where(there, ends, places[..., far, :])
     return places
 
@@ -133,11 +138,12 @@ def _bridged_places(measured: MeasuredJoints, gaps: _Gaps) -> Float[Tensor, "B T
 def _bridged_middle(middle: MiddlePoint, inside: Bool[Tensor, "B T"], rate: float) -> MiddlePoint:
     """Return the middle of the shoulders, in gaps too."""
     gaps = _find_gaps((middle.mask & inside)[..., None], rate)
-    missing, uv = gaps.inside, middle.uv[:, :, None]
-    cov = middle.cov.expand(*uv.shape[:2], 2, 2)[:, :, None]
-    places = torch.where(missing[..., None], _on_the_way(uv, gaps), uv)
-    covs = torch.where(missing[..., None, None], _NOISE * _on_the_way(cov, gaps), cov)
-    return MiddlePoint(places[:, :, 0], middle.mask | missing[..., 0], covs[:, :, 0])
+    cov = middle.cov.expand(*middle.mask.shape, 2, 2)[:, :, None]
+    return MiddlePoint(
+        _filled(middle.uv[:, :, None], gaps)[:, :, 0],
+        middle.mask | gaps.inside[..., 0],
+        _filled(cov, gaps, _NOISE)[:, :, 0],
+    )
 
 
 _Points = TypeVar("_Points", BodyPoints, FacePoints)
@@ -146,9 +152,8 @@ _Points = TypeVar("_Points", BodyPoints, FacePoints)
 def _bridged_points(points: _Points, inside: Bool[Tensor, "B T 1"], rate: float) -> _Points:
     """Return the keypoints of the whole body, or of the face, in gaps too."""
     gaps = _find_gaps((points.confidence > 0) & inside, rate)
-    missing = gaps.inside
-    places = torch.where(missing[..., None], _on_the_way(points.places, gaps), points.places)
-    return points._replace(places=places, confidence=points.confidence.masked_fill(missing, _SURE))
+    confidence = points.confidence.masked_fill(gaps.inside, _SURE)
+    return points._replace(places=_filled(points.places, gaps), confidence=confidence)
 
 
 def _moves(like: Tensor) -> Float[Tensor, " 8"]:

@@ -86,6 +86,11 @@ class MeasuredJoints(NamedTuple):
     body: BodyPoints | None = None
     bridged: Tensor | None = None
 
+    @property
+    def seen(self) -> Bool[Tensor, "B T 8"]:
+        """Return which joints are measured, those not that were put into gaps."""
+        return self.mask if self.bridged is None else self.mask & (self.bridged == 0)
+
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
     """Return the scale of the prior's camera at the neck of its mean pose; computed once for each prior."""

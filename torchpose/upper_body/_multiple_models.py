@@ -246,14 +246,12 @@ def _windows_of_limbs(model: TrackerModel) -> WindowMixture:
 
 
 def _log_ratios(
-    seen: Estimates, bodies: Estimates, measured: MeasuredJoints
+    windows: Estimates, bodies: Estimates, measured: MeasuredJoints
 ) -> Float[Tensor, "B T 2"]:
     """Return the log-likelihood ratio of windows to bones for both arms, and 1 where a limb is measured."""
-    ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (seen, bodies))
-    known = measured.mask
-    if measured.bridged is not None:
-        known = known & (measured.bridged == 0)
-    some = (known[..., ELBOWS] | known[..., HANDS]).any(-1)
+    ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (windows, bodies))
+    seen = measured.seen
+    some = (seen[..., ELBOWS] | seen[..., HANDS]).any(-1)
     apart = torch.where(some, (ours - theirs).nan_to_num(0.0), 0.0)
     return torch.stack([apart, some.to(apart)], -1)
 

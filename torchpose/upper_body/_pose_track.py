@@ -72,7 +72,7 @@ class PoseTrack:
             keypoint was given or it was an outlier.
         log_evidence: [B, T, 2], the increments log p(z_t | z_1:t-1) of the left and of the right arm.
             Both arms contain head and neck, so their sum is a score and not an evidence. With smoothing
-            over all frames, keypoints that were put into gaps count as measured.
+            over all frames, keypoints that were put into gaps may count as measured.
         lengths: [B], the number of frames of each sequence.
         matrix: the camera matrix K [3, 3] of the input.
         failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.
