@@ -345,6 +345,16 @@ def test_one_camera_needs_no_name(tmp_path):
             CameraError,
             "expected `distortions`, got `distortion`",
         ),
+        (
+            "[cam]\nmatrix = [[1,0,1],[0,1,1],[0,0,1]]\nsise = [640, 480]",
+            CameraError,
+            "expected `size`, got `sise`",
+        ),
+        (
+            "[cam]\nmatrix = [[1,0,1],[0,1,1],[0,0,1]]\ndist = [0.1, 0, 0, 0]",
+            CameraError,
+            "expected `distortions`, got `dist`",
+        ),
         ("[cam]\nmatrix = [[1,0,1],[0,1,1],[0,0,1]]\nrotation = [1]", CameraError, "rotation"),
     ],
 )

@@ -9,7 +9,14 @@ from torchpose.errors import CameraError, FileFormatError
 
 _KEYS = ("name", "size", "matrix", "distortions", "rotation", "translation", "fisheye", "up")
 _OF_CAMERAS = ("size", "distortions", "rotation", "translation")  # what no other table has
-_ALIKE = 0.8  # similarity of two keys from which on one is the other misspelt
+_ALIKE = 0.75  # similarity of two keys from which on one is the other misspelt
+_ELSEWHERE = {
+    "k": "matrix", "camera_matrix": "matrix", "d": "distortions", "dist": "distortions",
+    "dist_coeffs": "distortions", "distortion_coefficients": "distortions", "r": "rotation",
+    "rvec": "rotation", "t": "translation", "tvec": "translation", "image_size": "size",
+    "resolution": "size",
+}  # fmt: skip
+"""What other programs call these keys."""
 _ALL = "cameras"  # the table in which some programs put those of cameras, by their numbers
 _QUIET = ("metadata",)  # tables that are passed over without a word
 
@@ -49,9 +56,12 @@ def camera_tables(
 
 
 def check_keys(where: str, table: Mapping[str, Any]) -> None:
-    """Raise `CameraError` for a key that is misspelt: what it says would not count."""
+    """Raise `CameraError` for a key that is misspelt, or named as elsewhere: what it says would not count."""
     for key in table:
         meant = get_close_matches(key.lower(), _KEYS, 1, _ALIKE)
+        other = _ELSEWHERE.get(key.lower())
+        if other is not None and other not in table:
+            meant = [other]
         if key not in _KEYS and meant:
             raise CameraError(f"{where}: expected `{meant[0]}`, got `{key}`")
 
