@@ -105,7 +105,8 @@ class UpperBodyTracker(WideModule):
     `MeasuredJoints` in the prior's pixels, of which `screen_joints` leaves out outliers, an `Estimator`
     turns them into the `Estimates` of both arms, `read_out` joins these into a `ReadOut` of the body, which
     `MotionStage` steadies, and that becomes `SeenPoses` and a `PoseTrack`. `forward` passes all frames on
-    at once, `step` and `advance` some at a time, with the state of each stage.
+    at once, `step` and `advance` some at a time, with the state of each stage. Smoothing over all frames
+    puts keypoints into gaps before the estimator (`bridged_over_gaps`).
 
     Args:
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
