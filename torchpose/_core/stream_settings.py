@@ -11,7 +11,7 @@ from torchpose.errors import InputError
 StreamSettings = tuple[tuple[str, Any], ...]
 """Settings that give the numbers of a state their meaning, by name."""
 
-_COMPARED = (bool, int, float, str, Path, torch.dtype)
+_COMPARED = (bool, int, float, str, torch.dtype)
 
 
 def settings_of(settings: Mapping[str, Any]) -> StreamSettings:

@@ -58,12 +58,13 @@ def camera_tables(
 def check_keys(where: str, table: Mapping[str, Any]) -> None:
     """Raise `CameraError` for a key that is misspelt, or named as elsewhere: what it says would not count."""
     for key in table:
-        meant = get_close_matches(key.lower(), _KEYS, 1, _ALIKE)
+        if key in _KEYS:
+            continue
         other = _ELSEWHERE.get(key.lower())
-        if other is not None and other not in table:
-            meant = [other]
-        if key not in _KEYS and meant:
-            raise CameraError(f"{where}: expected `{meant[0]}`, got `{key}`")
+        if other is None or other in table:
+            other = next(iter(get_close_matches(key.lower(), _KEYS, 1, _ALIKE)), None)
+        if other is not None:
+            raise CameraError(f"{where}: expected `{other}`, got `{key}`")
 
 
 def table_text(name: str, table: Mapping[str, Any]) -> str:

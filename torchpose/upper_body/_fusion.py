@@ -45,7 +45,8 @@ _HAND_OF = tuple(
 )
 _WINDOWS = ("causal", "full")
 _OWN = (*_WINDOWS, "articulated")  # calibrations that nothing else stands for
-_NEAREST = 0.1  # metres before the camera, from where a projection means something
+NEAREST = 0.1
+"""Metres before the camera, from where a projection means something."""
 
 
 def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: RotationOrder) -> ReadOut:
@@ -116,7 +117,7 @@ def on_their_rays(
         poses: the poses of windows. matrix: K of the prior's camera. observed: which joints were measured.
     """
     depth, known = poses.joints[..., 2:], observed[..., None]
-    before = depth > _NEAREST
+    before = depth > NEAREST
     hands = known.index_select(2, index_tensor(_HAND_OF, known.device))
     seen = poses.joints @ matrix.mT
     uv = torch.where(hands & ~known & before, seen[..., :2] / depth, poses.uv)

@@ -22,6 +22,7 @@ from torchpose.upper_body._estimator import (
 )
 from torchpose.upper_body._estimator_table import METHODS
 from torchpose.upper_body._fusion import (
+    NEAREST,
     MotionStage,
     MotionStageState,
     ReadOut,
@@ -74,7 +75,6 @@ class PoseReader(NamedTuple):
         estimates: Estimates,
         found: Screened,
         lengths: Int[Tensor, " B"] | None = None,
-        used: MeasuredJoints | None = None,
     ) -> tuple[MotionStageState | None, PoseTrack]:
         """Return the next state of the motion stage, and the poses of T more frames.
 
@@ -83,15 +83,13 @@ class PoseReader(NamedTuple):
             estimates: the estimates of both arms, [B, T, ...]. found: the measurements they were made from.
             lengths: of whole sequences, the number of frames of each, [B]; past it the last pose is
                 repeated. None is T.
-            used: the measurements with keypoints in gaps too (`bridged_over_gaps`); None without these.
         """
         matrix, poses = self.prior.info.matrix_like(estimates.left.mean), estimates.poses
         if poses is None:
             reading = read_out(estimates, matrix, self.order)
             motion, reading = self._steadied(motion, reading, estimates, lengths)
             poses = in_camera_axes(reading, self.order)
-        poses = self._placed(poses, matrix, found.measured if used is None else used)
-        poses = self._tilted(poses, matrix)
+        poses = self._tilted(self._placed(poses, matrix, found.measured), matrix)
         notes = self.notes + outlier_notes(found.probability, found.exchanged, lengths)
         if lengths is None:
             lengths = torch.full((len(poses.uv),), poses.uv.shape[1], device=poses.uv.device)
@@ -137,7 +135,7 @@ class PoseReader(NamedTuple):
             joints3d=poses.joints,
             covariance2d=to_camera.covariances(poses.uv_covs),
             covariance3d=poses.covs,
-            observed=found.measured.mask,
+            observed=found.measured.seen,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
             effective_sample_size=torch.stack(
                 [out.effective_sample_size.double() for out in (left, right)], -1
@@ -197,7 +195,7 @@ def _less_sure(
         poses: in the camera's axes. matrix: K of the prior's camera. variance: metres squared.
     """
     eye = torch.eye(3).to(poses.covs)
-    scale = matrix.diagonal()[:2] / poses.joints[..., 2:].clamp_min(_NEAREST)
+    scale = matrix.diagonal()[:2] / poses.joints[..., 2:].clamp_min(NEAREST)
     return poses._replace(
         covs=poses.covs + variance[..., None, None] * eye,
         uv_covs=poses.uv_covs + torch.diag_embed(variance[..., None] * scale.square()),
@@ -227,7 +225,6 @@ def check_frame(frame: str, static_camera: bool) -> None:
         raise InputError("static_camera needs frame='camera': the body's axes know no camera")
 
 
-_NEAREST = 0.1  # metres before the camera, from where a projection means something
 _FEW = 2.0  # particles: below that, one of them has most of the weight
 # Share of the frames of an arm with so few, above which it is said: quick movements alone have fewer.
 _COLLAPSED_SHARE = 0.25

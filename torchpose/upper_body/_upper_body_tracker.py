@@ -305,12 +305,14 @@ class UpperBodyTracker(WideModule):
             there = given.mask.flatten(0, 1).any(0).tolist()
             reader = self._reader(there, picked, cov)
             _, found = screen_joints(self._screen(picked, cov), None, given)
-            used = found.measured
             if self._sees_all(keypoints.shape[1]):
-                used = bridged_over_gaps(used, lengths, self.fps or 30.0)
+                bridged = bridged_over_gaps(found.measured, lengths, self.fps or 30.0)
+                found = found._replace(measured=bridged)
             arms = generators_of_arms(generator)
-            estimates = reader.estimator.forward(used, arm_joints(there), arms, lengths, progress)
-            _, track = reader.read(None, estimates, found, lengths, used)
+            estimates = reader.estimator.forward(
+                found.measured, arm_joints(there), arms, lengths, progress
+            )
+            _, track = reader.read(None, estimates, found, lengths)
         return note_collapse(track.in_precision(self.dtype))
 
     if TYPE_CHECKING:  # nn.Module has Any
