@@ -196,7 +196,7 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 def check_positive(name: str, value: float) -> float:
     """Return a number, or raise `InputError` unless it is above 0 and finite."""
-    if not 0 < value < math.inf:
+    if isinstance(value, str) or not 0 < value < math.inf:
         raise InputError(f"{name} must be positive and finite, got {value}")
     return value
 

@@ -118,8 +118,9 @@ class KeypointBodyTracker(nn.Module):
         if keypoint_std is None:
             keypoint_std = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
         keypoint_std = check_positive("keypoint_std", keypoint_std)
-        pixel_std = check_positive("pixel_std", PIXEL_STD if pixel_std is None else pixel_std)
-        self.reader = KeypointReader(rig, keypoint_std, pixel_std)
+        self.reader = KeypointReader(
+            rig, keypoint_std, PIXEL_STD if pixel_std is None else pixel_std
+        )
         motion = load_body_motion("whole-body") if motion is None else motion
         if body is not None:
             motion = with_body(motion, body)

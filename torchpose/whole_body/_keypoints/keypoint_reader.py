@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import (
@@ -11,6 +11,7 @@ from torchpose._core.checks import (
     INLIER,
     MOST_CONFIDENCE,
     check_pixels,
+    check_positive,
     check_shape,
     refuse_half,
 )
@@ -21,6 +22,10 @@ from torchpose.errors import CameraError, InputError, ShapeError
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
+_STDS = (
+    1e-3,
+    1e6,
+)  # pixels, beyond which the filter's matrices are not positive definite in rounding
 
 
 class KeypointReader:
@@ -29,9 +34,16 @@ class KeypointReader:
     Args:
         rig: the cameras. keypoint_std: metres, how far a detector's joints are from the body's, along each
             axis. pixel_std: pixels, how far they are apart from that.
+
+    Raises:
+        InputError: a pixel_std that no image has.
     """
 
     def __init__(self, rig: CameraRig, keypoint_std: float, pixel_std: float) -> None:
+        if not _STDS[0] <= check_positive("pixel_std", pixel_std) <= _STDS[1]:
+            raise InputError(
+                f"pixel_std must lie between {_STDS[0]:g} and {_STDS[1]:g} pixels, got {pixel_std}"
+            )
         self.rig, self.keypoint_std, self.pixel_std = rig, keypoint_std, pixel_std
 
     def frames(
@@ -65,8 +77,8 @@ class KeypointReader:
         outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
         if bool(outside.any()):
             raise InputError(
-                f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(trust[outside][0]):g}; "
-                f"{CONFIDENCE_ADVICE}"
+                "confidence must lie in [0, 1] (0 or NaN is missing), got "
+                f"{self._first_of(trust, outside)}; {CONFIDENCE_ADVICE}"
             )
         trust = trust.clamp(0.0, 1.0)
         there = known & (trust > 0)
@@ -74,8 +86,13 @@ class KeypointReader:
         relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
         if covariance is not None:
             own, relative = covariance.to(points), torch.zeros_like(trust)
-            if not bool((own[there] > 0).all()):
-                raise InputError("covariance of keypoints must be positive, pixels squared")
+            least, most = (std**2 for std in _STDS)
+            wrong = there & ~((own >= least) & (own <= most))
+            if bool(wrong.any()):
+                raise InputError(
+                    f"covariance of keypoints must lie between {least:g} and {most:g} pixels squared, got "
+                    f"{self._first_of(own, wrong)}; a keypoint that tells nothing has the confidence 0"
+                )
         inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
         table = table.masked_fill(~there[..., None], torch.nan)
@@ -91,6 +108,13 @@ class KeypointReader:
             both.map(lambda value: value.narrow(axis, 0, n_joints)),
             both.map(lambda value: value.narrow(axis, n_joints, n_points - n_joints)),
         )
+
+    def _first_of(
+        self, values: Float[Tensor, "*batch C J"], wrong: Bool[Tensor, "*batch C J"]
+    ) -> str:
+        """Return the first of some values that are wrong, and its camera."""
+        at = tuple(wrong.nonzero()[0].tolist())
+        return f"{float(values[at]):g} of camera {self.rig.names[at[-2]]!r}"
 
     def _undistorted(self, table: Float[Tensor, "*batch C J 5"]) -> KeypointFrame:
         """Return keypoints of a table of pixels, both parts of the noise, and trust."""
