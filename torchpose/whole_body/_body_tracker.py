@@ -45,6 +45,8 @@ from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 from torchpose.whole_body._measured_keypoints import given_keypoints
 from torchpose.whole_body._particle_follower import set_up_particles
 
+_N_PARTICLES = 1000
+
 
 class BodyStream(NamedTuple):
     """Holds the state of `BodyTracker.step` between two frames.
@@ -153,7 +155,7 @@ class BodyTracker(OwnPrecisionModule):
         manifold: BackConstrainedGPLVM | str | Path | None = None,
         conditionals: LimbConditionals | str | Path | None = None,
         action: ActionSpace | ActionBank | str | Path | None = None,
-        n_particles: int = 1000,
+        n_particles: int = _N_PARTICLES,
         fps: float = 60.0,
         process_cov: Tensor | None = None,
         initial_cov: Tensor | None = None,
@@ -175,20 +177,25 @@ class BodyTracker(OwnPrecisionModule):
         rig = as_rig(cameras)
         check_room(rig)
         if method == KEYPOINT_METHOD:
-            noise = {"process_cov": process_cov, "initial_cov": initial_cov}
-            refuse([*given, *options, *given_of(noise)], f"for method {method}")
+            of_particles = {
+                "process_cov": process_cov, "initial_cov": initial_cov,
+                "n_particles": None if n_particles == _N_PARTICLES else n_particles,
+            }  # fmt: skip
+            refuse([*given, *options, *given_of(of_particles)], f"for method {method}")
         else:
             refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
             method = choose_method(method, given)
         self.method, self.fps = method, float(fps)
         self.notes: tuple[str, ...] = ()
+        person = body if body is None or isinstance(body, Body) else load_body(body)
         self._settings = settings_of({
-            "method": method, "fps": self.fps, "cameras": len(rig), "body": body, "height": height,
-            "n_particles": n_particles, **of_kalman, **given, **options,
+            "method": method, "fps": self.fps, "cameras": ", ".join(rig.names),
+            "body": None if person is None else f"{person.height:.4f} m", "height": height,
+            "n_particles": n_particles, "keypoint_std": keypoint_std, "pixel_std": pixel_std,
+            **of_kalman, **given, **options,
         })  # fmt: skip
         self.by_keypoints: KeypointBodyTracker | None = None
         if method == KEYPOINT_METHOD:
-            person = body if body is None or isinstance(body, Body) else load_body(body)
             self.cameras, self.n_particles = rig, 0
             self.by_keypoints = KeypointBodyTracker(
                 rig, fps, body=person, height=height,
@@ -197,7 +204,7 @@ class BodyTracker(OwnPrecisionModule):
             )  # fmt: skip
             return
         self._by_particles = set_up_particles(
-            method, rig, given, body, height, self.fps, n_particles,
+            method, rig, given, person, height, self.fps, n_particles,
             {**options, **given_of({"process_cov": process_cov})}, (keypoint_std, pixel_std),
         )  # fmt: skip
         self.filter, self.notes = self._by_particles.filter, self._by_particles.notes

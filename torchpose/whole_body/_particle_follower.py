@@ -19,7 +19,7 @@ from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.filters._measurements import check_lengths
 from torchpose.whole_body._body_arguments import whole_length
-from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
+from torchpose.whole_body._body_track import BodyTrack, repeat_last
 from torchpose.whole_body._filter_table import LEARNT, METHODS, make_filter, rebased
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
@@ -217,7 +217,7 @@ def set_up_particles(
     method: str,
     rig: CameraRig,
     given: Mapping[str, Any],
-    body: Body | str | Path | None,
+    body: Body | None,
     height: float | None,
     fps: float,
     n_particles: int,
@@ -233,7 +233,9 @@ def set_up_particles(
     """
     found = {kind: _model(kind, value, fps) for kind, value in given.items()}
     models = {kind: model for kind, (model, _) in found.items()}
-    person = rebased(_person(body, _HEIGHT if height is None else height), "parent", None)
+    if body is None:
+        body = Body.of_height(BODY_15, _HEIGHT if height is None else height)
+    person = rebased(body, "parent", None)
     upright, tracked, learnt = _bodies(method, person, models)
     particles = make_filter(method, tracked, learnt, fps, n_particles, options)
     own = METHODS[method].needs == "manifold"  # then the filter holds it
@@ -249,12 +251,6 @@ def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
     """Return a model with its noise for a frame rate, and notes about it."""
     model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
     return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
-
-
-def _person(body: Body | str | Path | None, height: float) -> Body:
-    if isinstance(body, Body):
-        return body
-    return Body.of_height(BODY_15, height) if body is None else load_body(body)
 
 
 def _bodies(method: str, person: Body, models: dict[str, Any]) -> tuple[Body, Body, Any]:

@@ -785,6 +785,8 @@ def test_a_known_body_keeps_its_bones(four, filtered):
         ({"confidence": torch.full((T, 4, 15), -1.0)}, InputError, "in \\[0, 1\\]"),
         ({"confidence": torch.ones(T, 4, 3)}, ShapeError, "confidence"),
         ({"covariance": torch.zeros(T, 4, 15)}, InputError, "covariance"),
+        ({"covariance": torch.full((T, 4, 15), math.inf)}, InputError, "got inf of camera '"),
+        ({"covariance": torch.full((T, 4, 15), 1e-12)}, InputError, "between 1e-06 and 1e.12"),
         ({"smoothing": "some"}, InputError, "smoothing"),
         ({"keypoints": None}, InputError, "keypoints"),
     ],
@@ -814,8 +816,12 @@ def test_cameras_in_millimetres_are_refused():
 
 
 @pytest.mark.parametrize(
-    "options", [{"n_layers": 3}, {"manifold": "walk"}, {"keypoint_std": -1.0}, {"height": 0.0}]
-)
+    "options",
+    [
+        {"n_layers": 3}, {"manifold": "walk"}, {"n_particles": 50}, {"keypoint_std": -1.0}, {"height": 0.0},
+        {"pixel_std": 1e-6}, {"keypoint_std": "0.01"},
+    ],
+)  # fmt: skip
 def test_options_of_other_methods_are_refused(options):
     with pytest.raises(InputError):
         tracker(ring(2), **options)
@@ -959,7 +965,15 @@ def test_states_of_a_tracker_with_other_options_are_refused(four):
         f"fps=15.0, got that of a tracker with fps={FPS:g}": BodyTracker(
             four.rig, "kalman", fps=15
         ),
-        "cameras=2, got that of a tracker with cameras=4": tracker(four.rig.select([0, 1])),
+        "with cameras='{0}, {1}', got .* cameras='{0}, {1}, .*'".format(*four.rig.names): tracker(
+            four.rig.select([0, 1])
+        ),
+        "with cameras=.*got that of a tracker with cameras=": tracker(
+            four.rig.select([1, 0, 2, 3])
+        ),
+        "pixel_std=9, got that of a tracker with pixel_std=None": tracker(four.rig, pixel_std=9),
+        "keypoint_std=0.1, got": tracker(four.rig, keypoint_std=0.1),
+        "body='1.9000 m', got": tracker(four.rig, body=Body.of_height(BODY_15, 1.9)),
         "height=1.9, got that of a tracker with height=None": tracker(four.rig, height=1.9),
         "with method='sir', .*got .* method='kalman'": BodyTracker(four.rig, "sir", fps=FPS),
     }
