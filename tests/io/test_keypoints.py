@@ -19,7 +19,7 @@ from torchpose.errors import (
 )
 from torchpose.io import Keypoints, read_keypoints, write_keypoints
 from torchpose.io._formats.keypoint_files import is_keypoint_header
-from torchpose.io._formats.openpose import _BODY_25B, read_openpose_people
+from torchpose.io._formats.openpose import _BODY_25B, holds_openpose, read_openpose_people
 from torchpose.skeleton import SKELETONS
 from torchpose.skeleton._joint_sets import COCO
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
@@ -542,6 +542,28 @@ def frame(folder, number: int | str, *people: dict):
     folder.mkdir(exist_ok=True)
     label = f"{number:012d}" if isinstance(number, int) else number
     (folder / f"clip_{label}_keypoints.json").write_text(json.dumps({"people": people}))
+
+
+@pytest.mark.parametrize("name", ["cam01_{:06d}.json", "cam01.{:04d}.json"])
+def test_files_with_the_names_that_pose2sim_gives_are_numbered_frames(tmp_path, name):
+    for number, people in ((7, [person(10)]), (9, []), (10, [person(13)])):
+        (tmp_path / name.format(number)).write_text(json.dumps({"people": people}))
+    (tmp_path / "calibration.json").write_text("{}")  # of something else
+    read = read_keypoints(tmp_path)
+    assert read.measured.all(-1).tolist() == [True, False, False, True]
+    assert (read.first_frame, holds_openpose(tmp_path)) == (7, True)
+    (tmp_path / name.format(7)).write_text('{"frames": []}')
+    assert not holds_openpose(tmp_path)
+
+
+@pytest.mark.parametrize(("confidence", "said"), [(1.02, False), (6.3, True)])
+def test_scores_that_are_no_probabilities_are_said(tmp_path, confidence, said):
+    frame(tmp_path / "json", 0, person(10, confidence), person(20, 0.4))
+    read = read_keypoints(tmp_path / "json")
+    everybody = read_openpose_people(tmp_path / "json")
+    for notes in (read.notes, everybody.notes):
+        assert any("up to 6.3 are no probabilities" in note for note in notes) == said
+    assert read.confidence.max() == 1
 
 
 @pytest.mark.parametrize("joints", [25, 18])

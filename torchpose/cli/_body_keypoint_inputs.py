@@ -335,7 +335,7 @@ def _read(
         table, notes = in_pixels(Path(path), people.keypoints, missing, size)
         trust = torch.from_numpy(people.confidence).masked_fill(torch.from_numpy(missing), 0.0)
         of_body = _of_body(path, torch.from_numpy(table), trust, people.names)
-        return CameraKeypoints(*of_body, None, None, notes, first=people.first)
+        return CameraKeypoints(*of_body, None, None, (*people.notes, *notes), first=people.first)
     found = read_keypoints(path, size)
     points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
     derived = count_given(found.names) < len(found.names)  # joints that are not used here

@@ -65,6 +65,7 @@ def _installation() -> str:
 
 
 def _describe(what: str) -> str:
+    from torchpose.io._formats.openpose import holds_openpose
     from torchpose.priors._upper_body_prior import known_priors, load_prior
 
     path = Path(what)
@@ -87,7 +88,7 @@ def _describe(what: str) -> str:
         return _describe_cameras(path)
     if path.suffix == ".npz":
         return _describe_npz(path)
-    if path.is_dir() and not any(path.glob("*_keypoints.json")):
+    if path.is_dir() and not holds_openpose(path):
         return _describe_recordings(path)
     if _holds_recordings(path):
         return _describe_recordings(path)

@@ -120,8 +120,8 @@ def read_keypoints(path: str | Path, image_size: tuple[int, int] | None = None) 
 
     Keypoints that are shares of the image, from 0 to 1, are multiplied by its size where this is known.
 
-    A folder: OpenPose's ``*_keypoints.json``, one per frame, of BODY_25, BODY_25B, COCO, Halpe, MediaPipe or
-    COCO-WholeBody. Of several people, the most confident one is followed; see
+    A folder: OpenPose's ``*_keypoints.json``, or those of Pose2Sim, one per frame, of BODY_25, BODY_25B,
+    COCO, Halpe, MediaPipe or COCO-WholeBody. Of several people, the most confident one is followed; see
     `torchpose.io._formats.openpose`.
 
     Args:
@@ -152,6 +152,7 @@ def _read(path: Path) -> RawKeypoints:
             found.confidence,
             n_people=found.n_people,
             first_frame=found.first,
+            notes=found.notes,
         )
     path = require_file(path)
     readers = {".npz": read_npz_keypoints, ".csv": read_csv_keypoints}

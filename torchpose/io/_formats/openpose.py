@@ -1,7 +1,7 @@
 """Read OpenPose output: a folder with one `*_keypoints.json` per frame.
 
-Other programs write the same files with the joint sets of their detectors, as Pose2Sim does. How many
-keypoints a person has tells the set.
+Other programs write the same files with the joint sets of their detectors, as Pose2Sim does under the names
+`cam01_000031.json` and `cam01.0031.json`. How many keypoints a person has tells the set.
 
 Of several people one is followed, the one of largest mean confidence in the first frame with people
 (`torchpose.io._formats.followed_person`). An empty list of people is a frame without measurements.
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchpose._core.checks import MOST_CONFIDENCE
 from torchpose._core.reading import check_span, read_json, reading
 from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError, InputError, NobodySeenError
@@ -22,6 +23,7 @@ from torchpose.skeleton._joint_sets import COCO, SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _SUFFIX = "_keypoints.json"
+_NAMES = f"*{_SUFFIX}, or *.json whose names end with the number of the frame"
 _LAYOUTS = {  # the first keypoints of everybody, by how many there are
     25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints, 17: COCO, 26: COCO,
     33: LANDMARKS, 133: COCO,
@@ -39,6 +41,7 @@ _MIDDLES = {"Neck": "Shoulder", "MidHip": "Hip"}  # of BODY_25
 _OFF_MIDDLE = 0.08  # of a person's extent; a detector is off by a tenth of it
 _EXPECTED = "OpenPose's JSON with people / pose_keypoints_2d"
 _FAR = 1e9  # pixels; no keypoint is there
+_BEGINNING = 4096  # bytes of a file, among which its people begin
 
 
 class OpenPosePerson(NamedTuple):
@@ -48,6 +51,7 @@ class OpenPosePerson(NamedTuple):
         keypoints: [T, J, 2], pixels, NaN where missing. confidence: [T, J].
         names: of what is taken of the joint set that the files hold.
         n_people: how many people are in each frame [T]. first: number of the first file.
+        notes: on confidences of another scale.
     """
 
     keypoints: np.ndarray
@@ -55,6 +59,7 @@ class OpenPosePerson(NamedTuple):
     names: tuple[str, ...]
     n_people: np.ndarray
     first: int
+    notes: tuple[str, ...]
 
 
 class OpenPosePeople(NamedTuple):
@@ -63,18 +68,21 @@ class OpenPosePeople(NamedTuple):
     Attributes:
         keypoints: [T, D, J, 2] of the up to D people of each frame, in the order of the file, NaN where
             there are fewer. confidence: [T, D, J]. names: as of one person. first: number of the first file.
+        notes: as of one person.
     """
 
     keypoints: np.ndarray
     confidence: np.ndarray
     names: tuple[str, ...]
     first: int
+    notes: tuple[str, ...]
 
 
 def read_openpose(folder: str | Path) -> OpenPosePerson:
     """Read a folder of OpenPose JSON files, and follow one person.
 
-    The number in front of ``_keypoints.json`` is the frame; frames without a file are missing.
+    The number in front of ``_keypoints.json``, or of ``.json``, is the frame; frames without a file are
+    missing.
 
     Args:
         folder: the folder.
@@ -87,10 +95,10 @@ def read_openpose(folder: str | Path) -> OpenPosePerson:
         InputError: no such files. NobodySeenError: nobody in any of them. FileFormatError: not OpenPose's
             JSON, or another number of keypoints; the file is named.
     """
-    frames, names, first = _read_frames(folder)
+    frames, names, first, notes = _read_frames(folder)
     table = follow_person(frames, len(names))
     n_people = np.array([len(group) for group in frames])
-    return OpenPosePerson(*_measured(table), names, n_people, first)
+    return OpenPosePerson(*_measured(table), names, n_people, first, notes)
 
 
 def read_openpose_people(folder: str | Path) -> OpenPosePeople:
@@ -105,23 +113,46 @@ def read_openpose_people(folder: str | Path) -> OpenPosePeople:
     Raises:
         InputError, NobodySeenError, FileFormatError: as `read_openpose`.
     """
-    frames, names, first = _read_frames(folder)
+    frames, names, first, notes = _read_frames(folder)
     table = np.zeros((len(frames), max(map(len, frames)), len(names), 3))
     for row, group in enumerate(frames):
         if group:
             table[row, : len(group)] = np.stack(group)
-    return OpenPosePeople(*_measured(table), names, first)
+    return OpenPosePeople(*_measured(table), names, first, notes)
 
 
-def _read_frames(folder: str | Path) -> tuple[list[list[np.ndarray]], tuple[str, ...], int]:
-    """Return the keypoints [J, 3] of the people of every frame, the J names, and the first number."""
+def holds_openpose(folder: Path) -> bool:
+    """Return whether a folder holds OpenPose's files, and not those of Azure Kinect, by names and people."""
+    files = _files_of(folder)
+    if not files or files[0].name.endswith(_SUFFIX):
+        return bool(files)
+    with reading(files[0], _EXPECTED), files[0].open("rb") as stream:
+        return b'"people"' in stream.read(_BEGINNING)
+
+
+def _read_frames(
+    folder: str | Path,
+) -> tuple[list[list[np.ndarray]], tuple[str, ...], int, tuple[str, ...]]:
+    """Return the keypoints [J, 3] of the people of every frame, the J names, the first number, and notes."""
     files = _files_by_frame(Path(folder))
     people = {frame: _people(path) for frame, path in files.items()}
     everybody = [person for group in people.values() for person in group]
     names = _layout(folder, everybody, len(files))
     first = min(files)
     taken = {frame: [one[: len(names)] for one in group] for frame, group in people.items()}
-    return [taken.get(frame, []) for frame in range(first, max(files) + 1)], names, first
+    frames = [taken.get(frame, []) for frame in range(first, max(files) + 1)]
+    return frames, names, first, _notes_on_confidence(everybody)
+
+
+def _notes_on_confidence(everybody: Sequence[np.ndarray]) -> tuple[str, ...]:
+    """Return a note if confidences [J, 3] are scores of a scale on which nearly all of them count as 1."""
+    most = max(float(person[:, 2].max()) for person in everybody)
+    if most <= MOST_CONFIDENCE:
+        return ()
+    return (
+        f"confidences of up to {most:.3g} are no probabilities: those above 1 count as 1, and the others as "
+        "they are, so doubtful keypoints may count as sure ones; write probabilities from 0 to 1",
+    )
 
 
 def _layout(folder: str | Path, everybody: Sequence[np.ndarray], n_frames: int) -> tuple[str, ...]:
@@ -148,14 +179,17 @@ def _measured(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _files_by_frame(folder: Path) -> dict[int, Path]:
     with reading(folder, "a folder"):
-        files = sorted(folder.glob(f"*{_SUFFIX}"))
+        files = _files_of(folder)
     if not files:
         if not any(folder.iterdir()):
             raise NobodySeenError(
-                f"{folder}: the folder is empty; expected OpenPose files *{_SUFFIX}"
+                f"{folder}: the folder is empty; expected OpenPose files {_NAMES}"
             )
-        raise InputError(f"{folder}: expected OpenPose files *{_SUFFIX}, found none")
-    found = [re.search(r"(\d+)$", path.name.removesuffix(_SUFFIX)) for path in files]
+        raise InputError(f"{folder}: expected OpenPose files {_NAMES}, found none")
+    found = [
+        re.search(r"(\d+)$", path.name.removesuffix(_SUFFIX).removesuffix(".json"))
+        for path in files
+    ]
     numbers = [int(match.group(1)) for match in found if match is not None]
     if len(numbers) < len(files):  # names without numbers: their order is all there is
         return dict(enumerate(files))
@@ -163,6 +197,12 @@ def _files_by_frame(folder: Path) -> dict[int, Path]:
         raise FileFormatError(f"{folder}: two files have one frame number; expected one video")
     check_span(folder, max(numbers) - min(numbers) + 1, len(numbers))
     return dict(zip(numbers, files, strict=True))
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Return the files of frames: those with OpenPose's names, else those with a number at the end."""
+    files = sorted(folder.glob(f"*{_SUFFIX}"))
+    return files or [path for path in sorted(folder.glob("*.json")) if path.stem[-1:].isdecimal()]
 
 
 def _people(path: Path) -> list[np.ndarray]:
