@@ -599,6 +599,36 @@ def test_videos_tell_the_rate_whether_or_not_they_are_drawn_into(track, tmp_path
     assert BodyTrack.load(tmp_path / "body.npz").fps == FPS
 
 
+def test_images_tell_no_rate(track, tmp_path):
+    (tmp_path / "images").mkdir()
+    for t in range(N):
+        cv2.imwrite(f"{tmp_path}/images/{t}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    words = ("--videos", tmp_path / "images", "--height", 1.75, "--overlay", "false")
+    done = track(tmp_path / "out", "front_json", "--camera-names", "[front]", *words, *PLAIN)
+    assert (done.code, "no input states a frame rate: 30 fps assumed" in done.out) == (0, True)
+
+
+@pytest.mark.parametrize(("n_shown", "shown"), [(N, range(N)), (2 * N, range(0, 2 * N, 2))])
+def test_each_keypoint_is_drawn_into_its_frame_at_any_stated_rate(
+    track, tmp_path, monkeypatch, n_shown, shown
+):
+    """A video of a frame for each of the keypoints, as slow motion, and one of twice their rate."""
+    with VideoWriter(tmp_path / "slow.mp4", 2 * FPS, (WIDTH, HEIGHT)) as writer:
+        for t in range(n_shown):
+            writer.write(np.full((HEIGHT, WIDTH, 3), 5 * t, np.uint8))
+    greys = []
+
+    def measured(image, *_, **__):
+        greys.append(float(image.mean()) / 5)
+        return image
+
+    monkeypatch.setattr("torchpose.video._overlay.draw_body", measured)
+    words = ("--camera-names", "[front]", "--videos", tmp_path / "slow.mp4", "--height", 1.75)
+    done = track(tmp_path / "out", "front.npz", *words, "--fps", FPS, "--pictures", "false")
+    assert (done.code, "read frame by frame" in done.out) == (0, n_shown == N), done.err
+    np.testing.assert_allclose(greys, list(shown), atol=0.5)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -78,6 +78,7 @@ class BodyKeypoints(NamedTuple):
             order.
         confidence: as points, without pixels. cameras: for the images in which the keypoints are.
         fps: frames per second. notes: on what was assumed.
+        lengths: how many frames the input of each camera has, None if it holds nobody.
     """
 
     points: Tensor
@@ -85,6 +86,7 @@ class BodyKeypoints(NamedTuple):
     cameras: "list[PinholeCamera]"
     fps: float
     notes: tuple[str, ...]
+    lengths: tuple[int | None, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -163,6 +165,7 @@ def read_body_keypoints(
         sizes += said
     rates = [part.fps for part in parts if part.fps is not None] or list(other_rates)
     rate, notes = common_rate(rates, fps)
+    lengths = tuple(len(found[c].points) if c in found else None for c in range(len(inputs)))
     parts, numbered = _by_number(parts, used)
     points, confidence, more = _in_step(parts, delays, used)
     notes += numbered + more + tuple(sizes) + blind
@@ -174,7 +177,7 @@ def read_body_keypoints(
     confidence = _of_all(confidence, seeing, len(cameras), 0.0)
     if not everybody:
         points, confidence = points[:, :, 0], confidence[:, :, 0]
-    return BodyKeypoints(points, confidence, fitted, rate, notes)
+    return BodyKeypoints(points, confidence, fitted, rate, notes, lengths)
 
 
 def _read_all(

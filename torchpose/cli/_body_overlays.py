@@ -159,7 +159,7 @@ class Films:
         videos: one for each camera. cameras: calibrated. delays: frames by which each began too early.
 
     Attributes:
-        rates: frames per second of each. sizes: (width, height) of each.
+        rates: frames per second of those that state a rate. sizes: (width, height) of each.
 
     Raises:
         InputError, FileFormatError: videos that cannot be read. CameraError: of another shape.
@@ -177,7 +177,7 @@ class Films:
         self._videos, self._delays = videos, delays or [0] * len(videos)
         self.names = [camera.name for camera in cameras]
         self._sources = [open_video(path) for path in videos]
-        self.rates = [float(source.fps) for source in self._sources]
+        self.rates = [float(source.fps) for source in self._sources if source.knows_rate]
         self.sizes = [source.size for source in self._sources]
         self._cameras = [
             fit_to_size(camera, size, path)[0]
@@ -191,9 +191,24 @@ class Films:
         for source in self._sources:
             source.close()
 
+    def rate_beside(self, keypoints: "BodyKeypoints") -> float | None:
+        """Return the rate at which the videos are read beside keypoints: theirs, or None for the videos' own.
+
+        Where the videos have a frame for each of the keypoints, these are of another rate than the videos
+        state, as in slow motion.
+        """
+        own = resampled = 0.0
+        for source, length in zip(self._sources, keypoints.lengths, strict=True):
+            if source.n_frames is not None and length is not None:
+                factor = keypoints.fps / source.fps if source.knows_rate else 1.0
+                own += abs(source.n_frames - length)
+                resampled += abs(factor * source.n_frames - length)
+        return None if own < resampled else keypoints.fps
+
     def showing(self, keypoints: "BodyKeypoints") -> "Films":
-        """Return the same with keypoints to be drawn, at whose frame rate the videos are read."""
+        """Return the same with keypoints to be drawn, beside which the videos are read."""
         self.fps, self._keypoints = keypoints.fps, keypoints
+        self._rate = self.rate_beside(keypoints)
         for shown, camera in zip(self._cameras, keypoints.cameras, strict=True):
             shown.rotation, shown.translation = camera.rotation, camera.translation
         return self
@@ -252,8 +267,10 @@ class Films:
     def _open(self, i: int) -> "VideoSource":
         from torchpose.video._source import open_video
 
-        same = abs(self.rates[i] / self.fps - 1) < _SAME_RATE
-        return open_video(self._videos[i], fps=None if same else self.fps)
+        rate = self._rate
+        if rate is not None and abs(self._sources[i].fps / rate - 1) < _SAME_RATE:
+            rate = None
+        return open_video(self._videos[i], fps=rate)
 
     def _seen(self, t: int, c: int) -> "Tensor":
         """Return the keypoints of a camera in pixels of its video, [K, 2] of all detections."""

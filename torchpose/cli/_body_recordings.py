@@ -245,8 +245,11 @@ def in_silhouettes(keypoints: BodyKeypoints, recordings: Recordings) -> BodyKeyp
             f"keypoints have {len(points)} frames and videos {there}; the first {count} are used",
         )
     cameras = [view.camera for view in recordings.views]
-    return BodyKeypoints(
-        points[:count], keypoints.confidence[:count], cameras, keypoints.fps, notes
+    return keypoints._replace(
+        points=points[:count],
+        confidence=keypoints.confidence[:count],
+        cameras=cameras,
+        notes=notes,
     )
 
 

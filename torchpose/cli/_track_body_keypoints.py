@@ -119,7 +119,10 @@ def track_keypoints(
             other_rates=[] if films is None else films.rates,
             everybody=settings.persons is not None,
         )  # fmt: skip
-        recordings = stack.enter_context(_recordings(shown, cameras, keypoints.fps, settings))
+        rate = keypoints.fps if films is None else films.rate_beside(keypoints)
+        if films is not None and rate is None:
+            keypoints = _with_note_on_rates(keypoints, films.rates)
+        recordings = stack.enter_context(_recordings(shown, cameras, rate, settings))
         start = time.perf_counter()
         if settings.finds_tilt:
             keypoints, settings = _with_tilt(keypoints, settings)
@@ -161,14 +164,28 @@ def _films(
 def _recordings(
     videos: list[str] | None,
     cameras: "Sequence[PinholeCamera]",
-    fps: float,
+    fps: float | None,
     settings: KeypointSettings,
 ) -> AbstractContextManager[Recordings | None]:
-    """Return the videos whose silhouettes count beside the keypoints, if they are to."""
+    """Return the videos whose silhouettes count beside the keypoints, if they are to.
+
+    Args:
+        fps: at which they are read, None for their own.
+    """
     if videos is None or settings.silhouettes is None:
         return nullcontext()
     own = settings.silhouettes._asdict()
     return Recordings(videos, cameras, fps=fps, delays=settings.delays, **own)
+
+
+def _with_note_on_rates(keypoints: BodyKeypoints, stated: Sequence[float]) -> BodyKeypoints:
+    """Return keypoints with a note that videos are read frame by frame, though they state other rates."""
+    rates = ", ".join(f"{rate:g}" for rate in sorted(set(stated)))
+    note = (
+        f"videos state {rates} frames per second and have a frame for each of the keypoints, which count as "
+        f"{keypoints.fps:g}: they are read frame by frame"
+    )
+    return keypoints._replace(notes=(*keypoints.notes, note))
 
 
 def _nobody(keypoints: BodyKeypoints) -> str:
