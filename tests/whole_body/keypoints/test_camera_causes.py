@@ -222,3 +222,18 @@ def test_delays_are_said_from_four_standard_deviations_on():
     turned_one = doubts._replace(turns=zero + 2, turn_sigmas=zero + 20)
     assert len(notes_on_cameras("abc", turned_one)) == 2
     assert len(notes_on_cameras("abc", turned_one, explained=True)) == 1
+
+
+@pytest.mark.parametrize(
+    ("refined", "late", "turned"),
+    [
+        ("none", 'refine="delays"', 'refine="extrinsics"'), ("delays", *['refine="both"'] * 2),
+        ("extrinsics", 'refine="both"', "found nothing"), ("both", *["found nothing"] * 2),
+    ],
+)  # fmt: skip
+def test_notes_do_not_recommend_what_was_refined(refined, late, turned):
+    zero = torch.zeros(2)
+    doubts = CameraDoubts(torch.tensor([0.0, 3.0]), zero + 0.1, zero + 2, zero + 20)
+    notes = notes_on_cameras("ab", doubts, refined=refined)
+    assert [word in note for word, note in zip((late, turned), notes, strict=True)] == [True, True]
+    assert all((", as refined," in note) == (refined != "none") for note in notes)

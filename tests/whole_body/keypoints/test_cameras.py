@@ -218,6 +218,13 @@ def test_notes_say_what_was_not_asked_for(right):
     )
 
 
+@pytest.mark.slow
+def test_notes_do_not_ask_for_what_was_refined(right):
+    """Delays that are estimated with wrong poses are wrong: both are to be."""
+    notes = track(right, disturbed(right.rig, 1, 1.5, 0.02), refine="delays").notes
+    assert "--refine both" in " ".join(notes) and "--refine delays" not in " ".join(notes), notes
+
+
 def test_a_refined_track_is_saved_and_read(in_step, tmp_path):
     in_step.save(tmp_path / "body.npz")
     again = BodyTrack.load(tmp_path / "body.npz")

@@ -96,32 +96,43 @@ def sure_delays(doubts: CameraDoubts) -> Float[Tensor, " C"]:
 
 
 def notes_on_cameras(
-    names: Sequence[str], doubts: CameraDoubts, explained: bool = False
+    names: Sequence[str], doubts: CameraDoubts, explained: bool = False, refined: str = "none"
 ) -> tuple[str, ...]:
     """Return notes on cameras that are surely and much wrong, and which option corrects them.
 
     Args:
-        names: of the cameras. doubts: about them. explained: whether something else than poses explains what
-            cameras see.
+        names: of the cameras. doubts: about them, as they are refined. explained: whether something else than
+            poses explains what cameras see. refined: which errors were asked to be estimated.
     """
+    as_refined = "" if refined == "none" else ", as refined,"
     notes = [
-        f"camera {names[c]} seems to have begun {_in_words(doubts.delays[c], doubts.delay_std[c])} than "
-        f'{names[0]}; refine="delays" (--refine delays) corrects that in recordings of one person'
+        f"camera {names[c]}{as_refined} seems to have begun "
+        f"{_in_words(doubts.delays[c], doubts.delay_std[c])} than {names[0]}; "
+        f"{_correction('delays', refined)}"
         for c in sure_delays(doubts).nonzero().flatten().tolist()
     ]
     turned = (doubts.turns > _LEAST_TURN) & (doubts.turn_sigmas > _SURE_TURN)
     if bool(turned.any()) and not explained:
         c = int(torch.where(turned, doubts.turn_sigmas, 0).argmax())
         notes.append(
-            f"camera {names[c]} sees joints {float(doubts.turns[c]):.1f} degrees away from where the others "
-            "have them, so the calibrated pose of this or of another camera is wrong; "
-            'refine="extrinsics" (--refine extrinsics) corrects that in recordings of one person'
+            f"camera {names[c]}{as_refined} sees joints {float(doubts.turns[c]):.1f} degrees away from where "
+            "the others have them, so the pose of this or of another camera is wrong; "
+            f"{_correction('extrinsics', refined)}"
         )
     return tuple(notes)
 
 
-def notes_on_refined(names: Sequence[str], refined: RefinedCameras, what: str) -> tuple[str, ...]:
+def _correction(kind: str, refined: str) -> str:
+    """Return which option corrects a kind of errors where some were refined; delays depend on poses."""
+    if refined == "both" or refined == kind == "extrinsics":
+        return "refine found nothing that explains it; check the calibration and the frame rates"
+    option = kind if refined == "none" else "both"
+    return f'refine="{option}" (--refine {option}) corrects that in recordings of one person'
+
+
+def notes_on_refined(names: Sequence[str], refined: RefinedCameras) -> tuple[str, ...]:
     """Return notes on what was corrected, with standard deviations; or that the cameras stay as given."""
+    what = refined.what
     if refined.kept:
         return (
             f"refine={what!r} found nothing that explains the keypoints better: cameras as given",

@@ -68,7 +68,7 @@ class RefinedCameras(NamedTuple):
         errors: of the cameras as they were given; zero where those are kept. rig: without their errors.
         frames: keypoints in time with the first camera. poses: of the body, [1, T, ...].
         gain: log-evidence for the corrected cameras against the given ones. kept: whether those stay.
-        what: which errors were estimated, one of `REFINED`.
+        what: which errors were asked to be estimated, one of `REFINED`.
     """
 
     errors: CameraErrors
@@ -103,12 +103,13 @@ def refine_cameras(
             as tracking has found them.
     """
     if turn is None or what == "delays" or not _some_are_turned(turn):
-        return _refined(rig, frames, track, fps, what, exchange, smoothing)
+        found = _refined(rig, frames, track, fps, what, exchange, smoothing)
+        return found._replace(what=what)
     known = CameraErrors.none(rig).values
     known[:, :3] = _turns_of(rig, turn)
     found = _refined(_corrected(rig, known), frames, track, fps, what, exchange, smoothing)
     errors = found.errors._replace(values=_one_after_another(known, found.errors.values))
-    return found._replace(errors=errors, kept=False)
+    return found._replace(errors=errors, kept=False, what=what)
 
 
 def _refined(

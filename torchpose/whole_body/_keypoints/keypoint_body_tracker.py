@@ -327,7 +327,7 @@ class KeypointBodyTracker(nn.Module):
         late = late_note(result.first_frame, TOO_FEW)
         given = frames.map(lambda value: value[0])
         still = notes_on_still_cameras(self.rig.names, given.pixels, given.inlier > 0, first_frame)
-        notes = (*notes_on_refined(self.rig.names, found, refine), *still, *result.notes, *late)
+        notes = (*notes_on_refined(self.rig.names, found), *still, *result.notes, *late)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})
 

@@ -179,7 +179,9 @@ class TrackBuilder:
         # turned cameras are said already
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange, turns=not turned)
         causes = notes_on_causes(rig, frame, sure_delays(doubts))
-        return (*causes, *notes, *notes_on_cameras(self.rig.names, doubts, bool(causes)))
+        asked = "none" if refined is None else refined.what
+        wrong = notes_on_cameras(self.rig.names, doubts, bool(causes), asked)
+        return (*causes, *notes, *wrong)
 
 
 def without_poses(track: BodyTrack) -> BodyTrack:
