@@ -23,6 +23,7 @@ from torchpose.whole_body._keypoints.camera_notes import (
 from torchpose.whole_body._keypoints.camera_order import agree_as_given, notes_on_order
 from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import RefinedCameras
+from torchpose.whole_body._keypoints.faulty_cameras import without_still_frames
 from torchpose.whole_body._keypoints.foot_filter import FootPoses
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import (
@@ -146,13 +147,14 @@ class TrackBuilder:
         refined: RefinedCameras | None,
         first_frame: int,
     ) -> tuple[str, ...]:
+        still = notes_on_still_cameras(self.rig.names, frame.pixels, frame.inlier > 0, first_frame)
+        frame = without_still_frames(frame)  # which did not count
         there = frame.inlier > 0
         notes = notes_of(
             self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
             poses.off, self.sized, first_frame,
         )  # fmt: skip
-        notes += notes_on_unsure_keypoints(frame.inlier)
-        notes += notes_on_still_cameras(self.rig.names, frame.pixels, there, first_frame)
+        notes += notes_on_unsure_keypoints(frame.inlier) + still
         notes += notes_on_upside_down_cameras(self.tracker.filter.up, self.rig.rotation)
         notes += notes_on_up(self.tracker.filter.up, poses.joints)
         floor = None if self.tracker.only is None else self.tracker.only.floor
