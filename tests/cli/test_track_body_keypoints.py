@@ -149,6 +149,30 @@ def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
     assert any("frame 0 is number 5000" in note for note in read("elsewhere", "beside").notes)
 
 
+def write_timed(path, points, times) -> None:
+    """Keypoints [T, 15, 2] as a table with times in place of numbers."""
+    header = ["time", *(f"{name}_{axis}" for name in BODY_15.names for axis in "xy")]
+    rows = np.column_stack([times, points.reshape(len(points), -1)])
+    np.savetxt(path, rows, delimiter=",", header=",".join(header), comments="", fmt="%.6f")
+
+
+@pytest.mark.parametrize(("later", "same_clock"), [(3 / FPS, True), (500.0, False)])
+def test_tables_are_brought_in_step_by_their_times(scene, tmp_path, later, same_clock):
+    """The second camera begins three frames later, and its stamps say so, in milliseconds."""
+    folder, _, points = scene
+    cameras = list(load_cameras(folder / "cameras.toml").values())[:2]
+    times = 12.3 + np.arange(N) / FPS
+    write_timed(tmp_path / "a.csv", points[:, 0].numpy(), times)
+    write_timed(tmp_path / "b.csv", points[3:, 1].numpy(), 1000 * (times[: N - 3] + later))
+    found = read_body_keypoints([str(tmp_path / "a.csv"), str(tmp_path / "b.csv")], cameras)
+    said = "frames of one time are taken as simult" if same_clock else "taken as simultaneous"
+    assert any(f"times 12.3 s, {12.3 + later:.12g} s; " in n and said in n for n in found.notes)
+    begun = 3 if same_clock else 0
+    assert len(found.points) == N - 3 + begun
+    assert found.points[:begun, 1].isnan().all()
+    torch.testing.assert_close(found.points[begun:, 1], points[3:, 1], atol=1e-5, rtol=0)
+
+
 def nobody_in(folder, kind):
     """An input in which a detector has found nobody."""
     if kind == "table":

@@ -45,6 +45,7 @@ class CameraKeypoints(NamedTuple):
         fps, size: of the images, (width, height), None if unknown. notes: of the reader.
         n_people: how many people the frames show [T], where one of them is followed.
         first: the number that the input gives to the first frame; None if it numbers none.
+        first_time: seconds, the time that it gives to the first frame in place of a number, if it does.
     """
 
     points: Tensor
@@ -54,6 +55,7 @@ class CameraKeypoints(NamedTuple):
     notes: tuple[str, ...] = ()
     n_people: Tensor | None = None
     first: int | None = None
+    first_time: float | None = None
 
     def after(self, n_frames: int) -> "CameraKeypoints":
         """Return the keypoints after some frames without any."""
@@ -166,7 +168,7 @@ def read_body_keypoints(
     rates = [part.fps for part in parts if part.fps is not None] or list(other_rates)
     rate, notes = common_rate(rates, fps)
     lengths = tuple(len(found[c].points) if c in found else None for c in range(len(inputs)))
-    parts, numbered = _by_number(parts, used)
+    parts, numbered = _in_time(parts, used)
     points, confidence, more = _in_step(parts, delays, used)
     notes += numbered + more + tuple(sizes) + blind
     notes += tuple(
@@ -258,19 +260,19 @@ def common_rate(rates: Sequence[float], given: float | None) -> tuple[float, tup
     return rates[0], ()
 
 
-def _by_number(
+def _in_time(
     parts: list[CameraKeypoints], inputs: Sequence[str]
 ) -> tuple[list[CameraKeypoints], tuple[str, ...]]:
-    """Return the keypoints with frames of one number side by side, and a note where that is to be said.
+    """Return the keypoints with frames of one number, or of one time, side by side, and a note on that.
 
-    Numbers count where all inputs are of one kind and have most of them in common: another kind of file, or
-    another cut of a video, may count from elsewhere.
+    Numbers, and times, count where all inputs are of one kind and have most of them in common: another kind
+    of file, or another cut of a video, may count from elsewhere.
     """
-    firsts = [part.first or 0 for part in parts]
+    firsts, what, shown = _first_frames(parts)
     begin = min(firsts)
     if len(set(firsts)) == 1:
         return parts, (f"frame 0 is number {begin} of the files",) * (begin > 0)
-    said = f"the first frames of the inputs have the numbers {', '.join(map(str, firsts))}"
+    said = f"the first frames of the inputs have the {what} {shown}"
     one_kind = len({Path(path).suffix.lower() for path in inputs}) == 1
     lengths = [len(part.points) for part in parts]
     shared = min(map(sum, zip(firsts, lengths, strict=True))) - max(firsts)
@@ -278,7 +280,21 @@ def _by_number(
         return parts, (f"{said}; they are taken as simultaneous",)
     moved = [part.after(first - begin) for part, first in zip(parts, firsts, strict=True)]
     counted = f", frame 0 is number {begin}" if begin else ""
-    return moved, (f"{said}; frames of one number are taken as simultaneous{counted}",)
+    return moved, (f"{said}; frames of one {what[:-1]} are taken as simultaneous{counted}",)
+
+
+def _first_frames(parts: Sequence[CameraKeypoints]) -> tuple[list[int], str, str]:
+    """Return the numbers of the first frames, what they are of, and that in words.
+
+    Where all inputs have times in place of numbers, frames are counted from the earliest time.
+    """
+    times = [(p.first_time, p.fps) for p in parts if p.first_time is not None and p.fps is not None]
+    if len(times) < len(parts):
+        firsts = [part.first or 0 for part in parts]
+        return firsts, "numbers", ", ".join(map(str, firsts))
+    begin = min(time for time, _ in times)
+    firsts = [round(fps * (time - begin)) for time, fps in times]
+    return firsts, "times", ", ".join(f"{time:.12g} s" for time, _ in times)
 
 
 def _in_step(
@@ -345,7 +361,7 @@ def _read(
     notes = found.notes[:-1] if derived else found.notes
     return CameraKeypoints(
         points[:, None], confidence[:, None], found.fps, found.image_size, notes, found.n_people,
-        found.first_frame,
+        found.first_frame, found.first_time,
     )  # fmt: skip
 
 

@@ -57,6 +57,7 @@ class Keypoints:
         notes: sentences on conversions of the file's keypoints.
         n_people: how many people are in each frame [T], of whom one is followed; None if the file holds one.
         first_frame: the number that the file gives to the first frame; None if it numbers none.
+        first_time: seconds, the time stamp of the first frame, of tables in which times number the frames.
     """
 
     keypoints: Tensor
@@ -70,6 +71,7 @@ class Keypoints:
     notes: tuple[str, ...] = ()
     n_people: Tensor | None = None
     first_frame: int | None = None
+    first_time: float | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -243,6 +245,7 @@ def _finish(path: Path, raw: RawKeypoints, image_size: tuple[int, int] | None) -
         notes=notes,
         n_people=None if raw.n_people is None else torch.from_numpy(raw.n_people),
         first_frame=raw.first_frame,
+        first_time=raw.first_time,
     )  # fmt: skip
     return _with_joints(keypoints) if lacks_joints(names) else keypoints
 

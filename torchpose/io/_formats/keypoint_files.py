@@ -22,6 +22,7 @@ from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError
 from torchpose.io._formats.raw_recording import numbers
 from torchpose.io._formats.table_rows import (
+    first_second,
     frame_rate,
     is_time,
     notes_on_uneven_times,
@@ -103,6 +104,7 @@ class RawKeypoints:
     n_people: np.ndarray | None = None
     first_frame: int | None = None
     notes: tuple[str, ...] = ()
+    first_time: float | None = None
 
 
 def read_npz_keypoints(path: Path) -> RawKeypoints:
@@ -154,6 +156,8 @@ def read_csv_keypoints(path: Path) -> RawKeypoints:
         raw.fps, raw.notes = _rate_by_times(rows[1:], times.stamps)
         if raw.fps is not None:
             left_out = [name for name in left_out if name != times.name]
+    if not counted and times is not None and raw.fps is not None:
+        raw.first_time = first_second(times.stamps, raw.fps)
     if left_out:
         shown = first_of(left_out, _SHOWN)
         raw.notes += (f"columns {shown} are passed over: x, y and a score of keypoints count",)

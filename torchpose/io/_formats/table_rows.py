@@ -151,6 +151,22 @@ def frame_rate(steps: np.ndarray, counts: np.ndarray | None = None) -> tuple[flo
     return rates[name], f"time stamps taken for {name}: {rates[name]:.3g} frames per second"
 
 
+def first_second(stamps: np.ndarray, fps: float) -> float | None:
+    """Return the first of some time stamps in seconds, by the unit that comes nearest to a frame rate.
+
+    None if no stamp is later than another.
+
+    >>> first_second(np.array([2000, 2033, 2067]), 30.0)
+    2.0
+    """
+    steps = np.diff(stamps)
+    if not (steps > 0).any():
+        return None
+    step = usual_step(steps[steps > 0])
+    tick = min(_TICKS, key=lambda tick: abs(math.log(fps * tick * step)))
+    return float(stamps[0] * tick)
+
+
 def notes_on_uneven_times(fps: float, frames: np.ndarray, stamps: np.ndarray) -> tuple[str, ...]:
     """Return a note if frames at the rate of `frame_rate` are far from their time stamps.
 
