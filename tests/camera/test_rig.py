@@ -1,6 +1,7 @@
 """Camera rigs: the cameras one by one, sizes, and OpenCV's projection with distortion."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -68,6 +69,12 @@ def test_scaled_keeps_the_middles_of_pixels_in_place():
     torch.testing.assert_close(
         rig.scaled(120, 320)(points).pixels[..., 0], (u + 0.5) / 2 - 0.5, rtol=1e-12, atol=1e-10
     )
+
+
+@pytest.mark.parametrize("path", ["cameras.toml", Path("cameras.toml")])
+def test_a_file_is_no_rig(path):
+    with pytest.raises(CameraError, match=r"got 'cameras\.toml'; load_cameras reads them"):
+        as_rig(path)
 
 
 def test_scaled_needs_sizes():

@@ -319,6 +319,11 @@ def as_rig(cameras: Cameras) -> CameraRig:
         return CameraRig([cameras])
     if isinstance(cameras, Mapping):
         return CameraRig(_named(cameras))
+    if isinstance(cameras, str | Path):
+        raise CameraError(
+            f"cameras must be a CameraRig or PinholeCamera, got {str(cameras)!r}; load_cameras reads them "
+            "from a file"
+        )
     if not isinstance(cameras, Iterable):
         raise CameraError(
             f"cameras must be a CameraRig or PinholeCamera, got {type(cameras).__name__}"

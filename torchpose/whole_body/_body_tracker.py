@@ -172,6 +172,8 @@ class BodyTracker(OwnPrecisionModule):
             raise InputError(
                 "height does nothing beside body, whose bones tell it; leave one of them out"
             )
+        _check_kind("body", body, Body)
+        _check_kind("motion", motion, BodyMotion)
         given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
         of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
         rig = as_rig(cameras)
@@ -543,6 +545,14 @@ class BodyTracker(OwnPrecisionModule):
 
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
+
+
+def _check_kind(name: str, value: object, kind: type) -> None:
+    """Raise `InputError` unless an argument is None, of a kind, or the name of a file."""
+    if not isinstance(value, kind | str | Path | None):
+        raise InputError(
+            f"{name} must be a {kind.__name__} or the name of its file, got {type(value).__name__}"
+        )
 
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:

@@ -6,6 +6,7 @@
 
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -286,10 +287,10 @@ def make_filter(
     filter_class, needs = METHODS[method]
     cost = filter_class.likelihoods_per_particle(options)
     least = cost * filter_class.least_particles
-    if n_particles < least:
+    if not isinstance(n_particles, Integral) or n_particles < least:
         raise InputError(
-            f"n_particles must be at least {least} for method {method}, so that several survive a "
-            f"frame, got {n_particles}"
+            f"n_particles must be a whole number and at least {least} for method {method}, so that several "
+            f"survive a frame, got {n_particles}"
         )
     settings = filter_class.tracking_options(body, fps, learnt)
     if options.keys() & {"process_cov", "step_std"}:  # one replaces the other

@@ -837,6 +837,23 @@ def test_other_methods_take_no_options_of_this_one(four):
         BodyTracker(four.rig, "apf")(keypoints=four.keypoints, persons=2)
 
 
+@pytest.mark.parametrize(
+    ("method", "options", "said"),
+    [
+        ("kalman", {"body": 3}, "body must be a Body or the name of its file, got int"),
+        ("kalman", {"motion": 3}, "motion must be a BodyMotion or the name"),
+        (
+            "sir",
+            {"n_particles": 20.5},
+            "n_particles must be a whole number and at least .* got 20.5",
+        ),
+    ],
+)
+def test_arguments_of_other_kinds_are_refused(method, options, said):
+    with pytest.raises(InputError, match=said):
+        BodyTracker(ring(2), method, **options)
+
+
 def test_the_tracker_is_at_the_top():
     assert torchpose.BodyTracker is BodyTracker
     assert math.isclose(tracker(ring(2)).fps, FPS)
