@@ -324,6 +324,17 @@ def test_the_body_is_drawn_into_videos(track, scene, tmp_path):
     assert "video ends" not in done.out
 
 
+def test_a_camera_whose_name_no_file_can_have_gets_its_overlay(torchpose, scene, tmp_path):
+    folder = scene[0]
+    camera = load_cameras(folder / "cameras.toml")["front"]
+    camera.name = "../rig/front"
+    save_cameras([camera], tmp_path / "cameras.toml")
+    done = torchpose("track-body", tmp_path / "cameras.toml", folder / "front.npz", "--videos",
+                     folder / "front.mp4", "--height", 1.75, *PLAIN, "--out", tmp_path / "out")  # fmt: skip
+    assert done.code == 0, done.err
+    assert (tmp_path / "out" / "overlay_.._rig_front.mp4").stat().st_size > 1000
+
+
 def test_the_body_is_drawn_as_a_turned_camera_sees_it(torchpose, scene, tmp_path, monkeypatch):
     folder = scene[0]
     cameras = list(load_cameras(folder / "cameras.toml").values())

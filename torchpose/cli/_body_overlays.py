@@ -1,5 +1,6 @@
 """Draw bodies into the videos of all cameras, by what `torchpose track-body` was given."""
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from torchpose.whole_body._body_track import BodyTrack
 
 _FOLDED = 0.01  # distance of a ray from what its pixel is undistorted to, at most, over its length
+_NO_FILE_NAME = re.compile(r'[\x00-\x1f"*/:<>?\\|]')
 _SAME_RATE = 0.01  # relative: of videos that are not resampled
 
 
@@ -48,7 +50,12 @@ class DrawnVideos(Protocol):
 
 
 def overlay_name(camera: str) -> str:
-    return f"overlay_{camera}.mp4"
+    """Return the name of a camera's video, without what a name of a file cannot have.
+
+    >>> overlay_name("rig/left")
+    'overlay_rig_left.mp4'
+    """
+    return f"overlay_{_NO_FILE_NAME.sub('_', camera)}.mp4"
 
 
 def span_of(people: "Sequence[BodyTrack]") -> tuple[int, int]:
