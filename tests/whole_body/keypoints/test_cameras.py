@@ -218,6 +218,18 @@ def test_notes_say_what_was_not_asked_for(right):
     )
 
 
+@pytest.mark.parametrize("refine", ["none", pytest.param("extrinsics", marks=pytest.mark.slow)])
+def test_no_other_reading_is_looked_for_where_turned_or_refined_cameras_agree(
+    right, monkeypatch, refine
+):
+    """By chance another convention of a camera may explain keypoints better than its wrong calibration."""
+    given = "torchpose.whole_body._keypoints.track_builder"
+    for name in ("notes_on_one_camera", "notes_on_order"):
+        monkeypatch.setattr(f"{given}.{name}", lambda *_: ("another reading",))
+    rig = disturbed(right.rig, 1, 1.5, 0.12)
+    assert "another reading" not in track(right, rig, refine=refine).notes
+
+
 @pytest.mark.slow
 def test_notes_do_not_ask_for_what_was_refined(right):
     """Delays that are estimated with wrong poses are wrong: both are to be."""

@@ -25,7 +25,7 @@ from torchpose.whole_body._keypoints.camera_readings import notes_on_one_camera
 from torchpose.whole_body._keypoints.camera_refinement import RefinedCameras
 from torchpose.whole_body._keypoints.faulty_cameras import without_still_frames
 from torchpose.whole_body._keypoints.foot_filter import FootPoses
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_of,
     notes_on_a_rolled_camera,
@@ -42,6 +42,7 @@ from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.nested import mapped
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
+from torchpose.whole_body._keypoints.turned_cameras import turned as turned_back
 
 _SEEN = 0.5  # probability that a keypoint is of its joint
 KEYPOINT_METHOD = "kalman"
@@ -170,14 +171,15 @@ class TrackBuilder:
             return notes + rolled
         if len(self.rig) == 1 or not cameras:
             return notes
-        maps, exchange = self.tracker.filter.maps, self.tracker.filter.exchange
+        exchange = self.tracker.filter.exchange
+        rig = self.rig if refined is None else refined.rig
+        maps = self.tracker.filter.maps if refined is None else RigMaps.of(rig)
         notes = (*notes_on_all_sides(self.tracker.filter, frame), *notes)
-        if not agree_as_given(maps, frame):
+        if not agree_as_given(maps, turned_back(frame, poses.turn, maps)):
             other = notes_on_order(self.rig.names, maps, frame)
-            other = other or notes_on_one_camera(self.rig, maps, frame, exchange)
+            other = other or notes_on_one_camera(rig, maps, frame, exchange)
             if other:
                 return (*other, *notes)
-        rig = self.rig if refined is None else refined.rig
         # turned cameras are said already
         doubts = doubt_cameras(rig, frame, poses.joints, self.fps, exchange, turns=not turned)
         causes = notes_on_causes(rig, frame, sure_delays(doubts))
