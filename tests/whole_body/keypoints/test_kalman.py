@@ -810,6 +810,20 @@ def test_keypoints_of_another_image_size_are_refused(four):
     assert len(tracker(four.rig)(keypoints=few)) == len(few)
 
 
+@pytest.mark.parametrize("persons", [None, "all"])
+def test_keypoints_of_larger_images_are_refused_by_a_single_camera(persons):
+    given = scene(1, n_frames=12)
+    given.keypoints[..., 0] += 300  # so that a part is to the right of the image of half the size
+    alone = tracker(given.rig)
+    keypoints = given.keypoints if persons is None else given.keypoints[:, :, None]
+    doubled = 2 * keypoints
+    with pytest.raises(CameraError, match="right of its image of 1920 x 1080 pixels or below"):
+        alone(keypoints=doubled, persons=persons)
+    assert alone.step(alone.init(), keypoints=doubled[0], persons=persons)  # one frame tells nothing
+    cut = keypoints + keypoints.new_tensor([0.0, 700.0])  # all but the head is below the image
+    assert alone(keypoints=cut, persons=persons)
+
+
 def test_cameras_in_millimetres_are_refused():
     camera = PinholeCamera(1300, 1300, 959.5, 539.5, 1920, 1080, translation=(0, 0, 4000.0))
     with pytest.raises(CameraError, match="metres"):

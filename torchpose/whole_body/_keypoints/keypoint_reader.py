@@ -22,10 +22,9 @@ from torchpose.errors import CameraError, InputError, ShapeError
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
-_STDS = (
-    1e-3,
-    1e6,
-)  # pixels, beyond which the filter's matrices are not positive definite in rounding
+_MANY = 150  # keypoints, which tell the size of images
+_BEYOND = 0.1  # share of keypoints to the right of an image, and below it
+_STDS = (1e-3, 1e6)  # pixels; beyond, matrices are not positive definite in rounding
 
 
 class KeypointReader:
@@ -98,6 +97,8 @@ class KeypointReader:
         table = table.masked_fill(~there[..., None], torch.nan)
         body, feet = body_joints(table, names), foot_points(table, names)
         self._check_inside(_pixels_of(body))
+        if len(self.rig) == 1:  # of several, how they agree tells it
+            self._check_size(body)
         if feet is None:
             return self._undistorted(body), None
         n_joints = body.shape[-2]
@@ -141,6 +142,31 @@ class KeypointReader:
                     f"{size[0]} pixels; if they are of a video of another size, take "
                     "rig.scaled(height, width)"
                 )
+
+    def _check_size(self, table: Float[Tensor, "*batch 1 J 5"]) -> None:
+        """Refuse keypoints of many frames that lie beyond the only camera's image as those of larger ones do.
+
+        They are to the right of it and below it, and hardly anywhere else. Hidden legs that a detector puts
+        below an image are hardly to the right of it.
+        """
+        size = self.rig.sizes[0]
+        weights = table[..., 4].nan_to_num(0.0)
+        if size is None or int((weights > 0).sum()) < _MANY:
+            return
+        height, width = size
+        u, v = _pixels_of(table).unbind(-1)
+        right, below, before = u > width - 0.5, v > height - 0.5, (u < -0.5) | (v < -0.5)
+        shares = [
+            float((weights * flags).sum() / weights.sum())
+            for flags in (right | below, right, below, before)
+        ]
+        if shares[0] > 0.5 and min(shares[1:3]) > _BEYOND > 2 * shares[3]:
+            raise CameraError(
+                f"most keypoints of camera {self.rig.names[0]!r} lie to the right of its image of {width} x "
+                f"{height} pixels or below it, as those of larger images do; give the calibration of the "
+                "images that the keypoints are of (`size` and `matrix`, or rig.scaled(height, width)), or "
+                "their size with the keypoints (image_size of .npz and .csv)"
+            )
 
 
 def _names_of(keypoints: Tensor, names: Sequence[str] | None) -> tuple[str, ...]:
