@@ -610,6 +610,18 @@ def test_a_person_of_no_persons_size_is_said():
     assert track(given).notes == ()
 
 
+@pytest.mark.parametrize("told", [{"height": 2.1}, {"body": Body.of_height(BODY_15, 1.4)}])
+def test_cameras_that_measure_another_size_than_was_given_say_so(told):
+    given = scene(3, n_frames=20, height=1.7)
+    (note,) = tracker(given.rig, **told)(keypoints=given.keypoints).notes
+    size = "2.10" if "height" in told else "1.40"
+    assert note.startswith(
+        f"the person is {size} m tall by the given height or body, and by the cam"
+    )
+    near = {name: 1.75 if name == "height" else Body.of_height(BODY_15, 1.6) for name in told}
+    assert tracker(given.rig, **near)(keypoints=given.keypoints).notes == ()
+
+
 # --- forms ------------------------------------------------------------------------------------------
 
 
@@ -819,7 +831,9 @@ def test_keypoints_of_larger_images_are_refused_by_a_single_camera(persons):
     doubled = 2 * keypoints
     with pytest.raises(CameraError, match="right of its image of 1920 x 1080 pixels or below"):
         alone(keypoints=doubled, persons=persons)
-    assert alone.step(alone.init(), keypoints=doubled[0], persons=persons)  # one frame tells nothing
+    assert alone.step(
+        alone.init(), keypoints=doubled[0], persons=persons
+    )  # one frame tells nothing
     cut = keypoints + keypoints.new_tensor([0.0, 700.0])  # all but the head is below the image
     assert alone(keypoints=cut, persons=persons)
 

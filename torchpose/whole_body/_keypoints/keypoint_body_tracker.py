@@ -136,7 +136,8 @@ class KeypointBodyTracker(nn.Module):
             lone=LoneNoise((std_of_one / keypoint_std) ** 2, _LASTING_OF_ONE * std_of_one),
             size_std=size_std, camera_height=camera_height,
         )  # fmt: skip
-        self.builder = TrackBuilder(self.tracker, rig, self.fps, sized)
+        told = height if body is None else body.height
+        self.builder = TrackBuilder(self.tracker, rig, self.fps, sized, told)
         self.feet = FootFilter(
             motion.articulation, copy.deepcopy(shipped_foot_prior()), self.fps,
             doubt=1.0 if alone else _DOUBT_OF_LEGS,

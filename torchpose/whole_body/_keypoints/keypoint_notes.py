@@ -21,6 +21,9 @@ _LEAST_TURN = (
 )
 _STRAYS = 30.0  # percent of its frames in which a camera has a detection that fits no person
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
+_OTHER_SIZE = (
+    1.12  # factor of the height from which on it is another one; proportions differ by less
+)
 _OFF_THE_FLOOR = 0.2  # metres of feet in half of the frames, from which on it is said
 _DOWN = 0.5  # of a unit vector, along the columns of an image
 _LYING = 60.0  # degrees of the trunk from the axis that points up, from which on it is said
@@ -129,13 +132,23 @@ def notes_on_unsure_keypoints(inlier: Float[Tensor, "T C J"]) -> tuple[str, ...]
     )
 
 
-def notes_on_size(height: float, n_cameras: int, sized: bool) -> tuple[str, ...]:
-    """Return a note if several cameras, which tell the size of a person, tell that of hardly anybody.
+def notes_on_size(height: float, n_cameras: int, told: float | None) -> tuple[str, ...]:
+    """Return a note if several cameras, which tell the size of a person, tell another one than was given.
+
+    Without one that was given, it is said if it is that of hardly anybody.
 
     Args:
-        height: of the estimated bones, metres. n_cameras: how many there are. sized: whether it was given.
+        height: of the estimated bones, metres. n_cameras: how many there are. told: height that was given.
     """
-    if sized or n_cameras == 1 or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
+    if n_cameras == 1:
+        return ()
+    if told is not None and not 1 / _OTHER_SIZE < height / told < _OTHER_SIZE:
+        return (
+            f"the person is {told:.2f} m tall by the given height or body, and by the cameras the bones are "
+            f"those of a person of {height:.2f} m; check height or body, whether cameras are in metres, and "
+            "whether keypoints are of images of the calibrated size",
+        )
+    if told is not None or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
         return ()
     return (
         f"the estimated bones are those of a person of {height:.2f} m; if that is wrong, the cameras are not "

@@ -57,11 +57,14 @@ class TrackBuilder:
 
     Args:
         tracker: that found the poses. rig: its cameras. fps: frames per second.
-        sized: whether the size of the person was given.
+        sized: whether the size of the person, or the camera's height, was given.
+        told: the height of the person, metres, if it was given.
     """
 
-    def __init__(self, tracker: KeypointTracker, rig: CameraRig, fps: float, sized: bool) -> None:
-        self.tracker, self.rig, self.fps, self.sized = tracker, rig, fps, sized
+    def __init__(
+        self, tracker: KeypointTracker, rig: CameraRig, fps: float, sized: bool, told: float | None
+    ) -> None:
+        self.tracker, self.rig, self.fps, self.sized, self.told = tracker, rig, fps, sized, told
 
     def track(
         self,
@@ -96,7 +99,7 @@ class TrackBuilder:
         notes: tuple[str, ...] = ()
         if summed_up:
             notes = self._notes(poses, frame, cameras, refined, first_frame)
-            notes += notes_on_size(rigid.height, len(self.rig), self.sized)
+            notes += notes_on_size(rigid.height, len(self.rig), self.told)
         return BodyTrack(
             rigid,
             state,
