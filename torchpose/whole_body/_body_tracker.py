@@ -272,10 +272,10 @@ class BodyTracker(OwnPrecisionModule):
         """Track one person from the first frame whose silhouettes all show a person, or that has keypoints.
 
         Args:
-            keypoints: [T, C, J, 2], pixels as detected, NaN where there is none; "kalman" takes
-                [B, T, C, J, 2] as well, and of these arguments only the first seven, `lengths` and
-                `progress`. With `persons` [T, C, D, J, 2], of D detections in each camera, in any order, NaN
-                where there are fewer.
+            keypoints: [T, C, J, 2], pixels as detected; NaN where there is none, or exactly (0, 0) or
+                (-1, -1), as many detectors write. "kalman" takes [B, T, C, J, 2] as well, and of these
+                arguments only the first seven, `lengths` and `progress`. With `persons` [T, C, D, J, 2], of
+                D detections in each camera, in any order, NaN where there are fewer.
             confidence: [..., C, J], from 0 (no keypoint) to 1; all 1 by default.
             names: of the J joints, of any known set; those of `BODY_15` by default.
             covariance: [..., C, J], variance along u and v, pixels squared, in place of the usual noise.

@@ -887,6 +887,20 @@ def test_the_tracker_is_at_the_top():
     assert math.isclose(tracker(ring(2)).fps, FPS)
 
 
+@pytest.mark.parametrize("nothing", [0.0, -1.0])
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_what_detectors_write_where_they_found_nothing_is_missing(cameras, nothing):
+    given = scene(cameras, 8)
+    missing = torch.zeros(given.keypoints.shape[:-1], dtype=torch.bool)
+    missing[:2], missing[:, 0, 3] = True, True
+    filled, unknown = (
+        given.keypoints.masked_fill(missing[..., None], value) for value in (nothing, math.nan)
+    )
+    found, wanted = (tracker(given.rig)(keypoints=values) for values in (filled, unknown))
+    assert found.first_frame == wanted.first_frame == 2
+    torch.testing.assert_close(found.joints3d, wanted.joints3d, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("nothing", [math.nan, 0.0])
 def test_the_covariance_of_a_missing_keypoint_does_not_matter(nothing):
     given = scene(2, 4)

@@ -72,7 +72,8 @@ class KeypointReader:
         points = keypoints.to(self.rig.matrix)
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
         trust = trust.nan_to_num(0.0)
-        known = torch.isfinite(points).all(-1)
+        filled = (points == 0).all(-1) | (points == -1).all(-1)  # where detectors found nothing
+        known = torch.isfinite(points).all(-1) & ~filled
         outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
         if bool(outside.any()):
             raise InputError(
