@@ -1,5 +1,6 @@
 """`torchpose info`: every kind of file, and what is none."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -167,3 +168,15 @@ def test_refusals(name, message, torchpose, files, tmp_path):
     (tmp_path / "empty").mkdir()
     done = torchpose("info", tmp_path / name)
     assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1
+
+
+def test_several_people_and_notes_on_keypoints_are_shown(torchpose, tmp_path):
+    people = [
+        {"pose_keypoints_2d": [value for i in range(25) for value in (x, 100.0 + 9 * i, score)]}
+        for x, score in ((50.0, 6.3), (400.0, 3.0))
+    ]
+    for t in range(2):
+        (tmp_path / f"cam_{t}_keypoints.json").write_text(json.dumps({"people": people}))
+    shown = torchpose("info", tmp_path).out
+    assert "several people, up to 2, from frame 0 on" in shown
+    assert "confidences of up to 6.3 are no probabilities" in shown

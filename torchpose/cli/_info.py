@@ -209,6 +209,7 @@ def describe_keypoints(keypoints: "Keypoints") -> str:
     """Return the frames, joints and camera of a file of keypoints."""
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.cli._track_output import camera_text, percent
+    from torchpose.io._keypoints import said_of_crowd
     from torchpose.skeleton._joint_sets import UPPER_BODY
     from torchpose.skeleton._upper_body import upper_body_indices
 
@@ -231,6 +232,8 @@ def describe_keypoints(keypoints: "Keypoints") -> str:
             "neck, hand": f"{keypoints.neck or found.neck or 'not stated'}, {found.hand or 'none'}",
             "image": "" if size is None else f"{size[0]} x {size[1]} pixels",
             "camera": camera if K is None else camera_text(PinholeCamera.from_matrix(K)),
+            "people": said_of_crowd(keypoints.n_people, keypoints.keypoints),
+            "notes": "; ".join(keypoints.notes),
         }
     )
 
