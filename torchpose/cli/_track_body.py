@@ -173,7 +173,8 @@ def run(
         sharpness: the exponent of the likelihood of silhouettes (default 100, for constrained 30; the papers
             have 1). It is not for root, nor for apf without keypoints, which compute theirs.
         method_options: the options of the filter.
-        fps: the frame rate of the keypoints, and at which all videos are read.
+        fps: the frame rate of the keypoints, and at which all videos are read, unless those of --videos have
+            a frame for each of the keypoints.
         delays: the number of frames to skip at the beginning of each input, at the rate of fps if it is given
             (default none).
         seed: the seed of the filter; kalman has none.
