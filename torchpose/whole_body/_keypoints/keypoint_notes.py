@@ -21,9 +21,8 @@ _LEAST_TURN = (
 )
 _STRAYS = 30.0  # percent of its frames in which a camera has a detection that fits no person
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
-_OTHER_SIZE = (
-    1.12  # factor of the height from which on it is another one; proportions differ by less
-)
+# Factor of the height from which on it is another one; proportions differ by less.
+_OTHER_SIZE = 1.12
 _OFF_THE_FLOOR = 0.2  # metres of feet in half of the frames, from which on it is said
 _DOWN = 0.5  # of a unit vector, along the columns of an image
 _LYING = 60.0  # degrees of the trunk from the axis that points up, from which on it is said
