@@ -110,13 +110,31 @@ class BodyGaussian(NamedTuple):
         return Beliefs(self.log_odds, self.scale)
 
 
+class Widened(NamedTuple):
+    """Holds variances that predictions got [*batch, N].
+
+    Attributes:
+        jumped: where joints had jumped. carried: where no camera saw a hip.
+    """
+
+    jumped: Tensor
+    carried: Tensor
+
+
+class Speeds(NamedTuple):
+    """Holds velocities of joints [B, J, 3], metres per second, and their covariances [B, J, 3, 3]."""
+
+    velocity: Tensor
+    cov: Tensor
+
+
 class CorrectedBody(NamedTuple):
     """Holds what a correction gives.
 
     Attributes:
         state: the posterior. joints: [B, J, 3], metres. joint_cov: [B, J, 3, 3], metres squared.
         weighed: of the keypoints, by the posterior mean. log_evidence: [B], by Laplace's approximation.
-        widened: [B, N], variances that the prediction got where joints had jumped.
+        widened: by what the prediction was. speeds: of the joints.
     """
 
     state: BodyGaussian
@@ -124,7 +142,8 @@ class CorrectedBody(NamedTuple):
     joint_cov: Tensor
     weighed: Weighed
     log_evidence: Tensor
-    widened: Tensor
+    widened: Widened
+    speeds: Speeds
 
 
 class _Elsewhere(NamedTuple):
@@ -291,7 +310,7 @@ class BodyKalmanFilter(nn.Module):
         state = state._replace(cov=state.cov + torch.diag_embed(carried))
         state = replaced(state, rows, self._with_leans(taken(state, rows)))
         corrected = self._corrected_as_predicted(state, frame, readings)
-        return corrected._replace(widened=corrected.widened + carried)
+        return corrected._replace(widened=corrected.widened._replace(carried=carried))
 
     def without_hips(self, frame: KeypointFrame) -> Int[Tensor, " N"]:
         """Return the elements of whom none of several cameras sees a hip, but something else.
@@ -360,7 +379,8 @@ class BodyKalmanFilter(nn.Module):
         cov = wide.cov + torch.diag_embed(widened)
         wide = wide._replace(mean=mean, cov=cov, log_odds=log_odds)
         again = self._iterated(wide, readings_of(frame, self.exchange), _RECOVERY)
-        return replaced(corrected, rows, again._replace(widened=widened))
+        again = again._replace(widened=again.widened._replace(jumped=widened))
+        return replaced(corrected, rows, again)
 
     def turned_back(
         self,
@@ -458,9 +478,36 @@ class BodyKalmanFilter(nn.Module):
             state.agreed,
         )
         evidence = weighed.log_evidence + fit
+        none = torch.zeros_like(step.step)
+        speeds = self._speeds(after, last.H)
         return CorrectedBody(
-            after, joints, joint_cov, weighed, evidence, torch.zeros_like(step.step)
+            after, joints, joint_cov, weighed, evidence, Widened(none, none), speeds
         )
+
+    def _speeds(self, state: BodyGaussian, H: Float[Tensor, "B K N"]) -> Speeds:
+        """Return how fast joints move, by the derivative of their places."""
+        velocities = self.articulation.columns["velocity"]
+        by_pose = H[..., : self.articulation.n_pose]
+        velocity = (by_pose @ state.mean.velocity[..., None]).unflatten(-2, (-1, 3)).squeeze(-1)
+        cov = by_pose @ state.cov[..., velocities, velocities] @ by_pose.mT
+        return Speeds(velocity, point_blocks(cov))
+
+    def held_still(
+        self, state: BodyGaussian, variance: Float[Tensor, "B J"], time: float
+    ) -> BodyGaussian:
+        """Return the Gaussian after a share of the information that joints do not move.
+
+        Args:
+            state: of [B]. variance: of their velocities along every axis, infinite where nothing is known.
+            time: seconds, within which that would decide alone.
+        """
+        _, jacobian = self.articulation.linearise(state.mean)
+        by_pose = jacobian.flatten(-3, -2)[..., : self.articulation.n_pose]
+        H = torch.zeros_like(jacobian.flatten(-3, -2))
+        H[..., self.articulation.columns["velocity"]] = by_pose
+        gap = -(by_pose @ state.mean.velocity[..., None]).squeeze(-1)
+        expected = Expected(gap, variance.repeat_interleave(3, -1), H)
+        return self._with_expected(state, expected, 1 / (self.fps * time))
 
     def _next_scale(
         self,

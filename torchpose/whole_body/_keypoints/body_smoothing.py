@@ -20,6 +20,29 @@ class BodyMoments(NamedTuple):
     cov: Tensor
 
 
+def from_last_seen(
+    jumped: Float[Tensor, "B T N"],
+    seen: Bool[Tensor, "B T J"],
+    started: Bool[Tensor, "B T"],
+    carriers: Float[Tensor, "J N"],
+) -> Float[Tensor, "B T N"]:
+    """Return variances of jumps in the frame after that in which their joint was last seen.
+
+    A joint that returns elsewhere than predicted did not jump there when it returned: its motion differed
+    since it was hidden. With the jump at the end of the gap nothing of later frames would reach into it.
+
+    Args:
+        jumped: variances in the frames in which joints had jumped. seen: joints. started: frames in which
+            tracking began anew. carriers: of `Articulation`, which columns move a joint.
+    """
+    hidden = torch.zeros_like(seen)
+    hidden[:, 1:] = ~seen[:, :-1] & ~started[:, 1:, None]
+    columns = hidden.to(jumped) @ carriers.to(jumped) > 0
+    frames = torch.arange(seen.shape[1], device=seen.device)[:, None]
+    first = frames.where(~columns, 0).cummax(1).values
+    return (jumped * ~columns).scatter_add(1, first, jumped * columns)
+
+
 def smooth(
     filter: BodyKalmanFilter,
     filtered: BodyMoments,

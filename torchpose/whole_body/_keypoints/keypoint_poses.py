@@ -9,6 +9,7 @@ from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedB
 from torchpose.whole_body._keypoints.body_size import SizeBelief
 from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults
 from torchpose.whole_body._keypoints.lifted_pose import LifterMemory
+from torchpose.whole_body._keypoints.still_joints import StillJoints
 
 
 class KeypointStream(NamedTuple):
@@ -26,6 +27,7 @@ class KeypointStream(NamedTuple):
         unseen: [B, J], seconds since a keypoint was a joint's, infinite where none has been.
         coasting: [B], of whom nothing was measured in the last frame.
         own_sides: [B, C, 2], of `evidence_of_own_sides`.
+        still: of [B], which joints stood still when they were last seen.
     """
 
     state: BodyGaussian
@@ -39,6 +41,7 @@ class KeypointStream(NamedTuple):
     unseen: Tensor
     coasting: Tensor
     own_sides: Tensor
+    still: StillJoints
 
 
 class KeypointPoses(NamedTuple):

@@ -24,9 +24,10 @@ from torchpose.whole_body._keypoints.body_kalman import (
     BodyGaussian,
     BodyKalmanFilter,
     CorrectedBody,
+    Widened,
 )
 from torchpose.whole_body._keypoints.body_size import SizeBelief
-from torchpose.whole_body._keypoints.body_smoothing import BodyMoments, smooth
+from torchpose.whole_body._keypoints.body_smoothing import BodyMoments, from_last_seen, smooth
 from torchpose.whole_body._keypoints.faulty_cameras import (
     CameraFaults,
     corrected,
@@ -73,6 +74,7 @@ from torchpose.whole_body._keypoints.nested import (
 )
 from torchpose.whole_body._keypoints.only_camera import OnlyCamera
 from torchpose.whole_body._keypoints.pose_maker import PoseMaker
+from torchpose.whole_body._keypoints.still_joints import StillJoints, with_still_joints
 from torchpose.whole_body._keypoints.watched_cameras import by_right_cameras
 
 _LEAST_SHARE = 1e-9  # least share of information: with none the variance would be infinite
@@ -231,6 +233,7 @@ class KeypointTracker(nn.Module):
             unseen=never,
             coasting=torch.zeros_like(begun),
             own_sides=torch.zeros_like(found.state.log_odds),
+            still=StillJoints.none(never),
         )
         return self._with_lifted(stream, lifted, found), found, begun
 
@@ -241,6 +244,7 @@ class KeypointTracker(nn.Module):
         memory, lifted = self._lifted(stream, frame)
         if predicted is None:
             predicted = self.filter.predict(stream.state, stream.coasting)
+        predicted = with_still_joints(self.filter, predicted, stream.still, frame)
         if lifted is None:
             memory, spread, likely = self._with_guessed_legs(stream, memory, frame, predicted)
             stream = stream._replace(spread=spread)
@@ -262,6 +266,7 @@ class KeypointTracker(nn.Module):
             lost=torch.where(due, 0.0, stream.lost),
             alone=torch.where(due, NOBODY, stream.alone),
             memory=memory,
+            still=stream.still.forgotten(due),
         )
         if lifted is None:
             stream = stream._replace(unseen=stream.unseen.masked_fill(due[:, None], torch.inf))
@@ -408,10 +413,14 @@ class KeypointTracker(nn.Module):
     def _with_lifted(
         self, stream: KeypointStream, lifted: Lifted | None, found: CorrectedBody
     ) -> KeypointStream:
-        """Return the stream with how unsure lifted joints are, and for how long joints have not been seen."""
-        seen = found.weighed.inlier.amax(1) > 0.5
-        unseen = torch.where(seen, 0.0, stream.unseen + 1 / self.filter.fps)
-        stream = stream._replace(unseen=unseen)
+        """Return the stream with how unsure lifted joints are, and for how long joints have not been seen.
+
+        It also has which of them stand still.
+        """
+        seen, dt = found.weighed.inlier.amax(1) > 0.5, 1 / self.filter.fps
+        unseen = torch.where(seen, 0.0, stream.unseen + dt)
+        still = stream.still.later(found.speeds, seen, dt)
+        stream = stream._replace(unseen=unseen, still=still)
         if lifted is None:
             return stream
         spread = torch.where(lifted.std.isfinite(), lifted.std, stream.spread)
@@ -450,15 +459,18 @@ class KeypointTracker(nn.Module):
 
     # --- whole sequences --------------------------------------------------------------------------
 
-    def smoothed(self, filtered: KeypointPoses, widened: Float[Tensor, "B T N"]) -> KeypointPoses:
+    def smoothed(self, filtered: KeypointPoses, widened: Widened) -> KeypointPoses:
         """Return poses for which later frames count too, up to where tracking began anew.
 
         Args:
-            filtered: with states of `to_be_smoothed`, which are written over. widened: as there.
+            filtered: with states of `to_be_smoothed`, which are written over. widened: as there [B, T, N].
         """
+        seen, carriers = filtered.unseen == 0, self.filter.articulation.carriers
+        jumped = from_last_seen(widened.jumped, seen, filtered.started, carriers)
         poses = filtered if self.only is None else self.only.as_last_told(filtered)
         states = BodyMoments(poses.point, poses.state_cov)
-        for rows, part in smooth(self.filter, states, widened, poses.started, poses.coasting):
+        wider = jumped + widened.carried
+        for rows, part in smooth(self.filter, states, wider, poses.started, poses.coasting):
             write_part(
                 _smoothed_fields(poses),
                 rows,
@@ -481,9 +493,7 @@ class KeypointTracker(nn.Module):
         return poses if self.only is None else self.only.sized(poses)
 
 
-def to_be_smoothed(
-    pose: KeypointPoses, found: CorrectedBody
-) -> tuple[KeypointPoses, Float[Tensor, "B N"]]:
+def to_be_smoothed(pose: KeypointPoses, found: CorrectedBody) -> tuple[KeypointPoses, Widened]:
     """Return the poses of a frame with the states as they were filtered, and by what these were widened."""
     return pose._replace(point=found.state.mean, state_cov=found.state.cov), found.widened
 

@@ -74,6 +74,7 @@ def step_by_one(step: KeypointStep, by_one: KeypointStep, camera: int) -> Keypoi
         lost=after.lost,
         alone=alone,
         memory=mapped(into_all, stream.memory, after.memory),
+        still=after.still,
     )
     pose = one._replace(
         inlier=into_all(torch.zeros_like(pose.inlier), one.inlier),
