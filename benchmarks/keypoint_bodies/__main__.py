@@ -13,15 +13,16 @@ Pose2Sim a person is seen by four real cameras: every one is predicted from the 
     python -m benchmarks.keypoint_bodies --data DIR --sitting [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --lying [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --desk
+    python -m benchmarks.keypoint_bodies --data DIR --hidden
     python -m benchmarks.keypoint_bodies --data DIR --uncalibrated [--lifters FILE]
     python -m benchmarks.keypoint_bodies --data DIR --choose
     python -m benchmarks.keypoint_bodies --data DIR --fit FILE.safetensors [--upper-body]
 
 The second line shows what noise costs by itself, in several cameras. The third tells one camera how high it
 is. The fourth shows people who sit to one camera, the fifth people who lie. The sixth shows people whose
-hips and legs are hidden to two cameras. The seventh tilts a camera that nobody calibrated. The eighth prints
-what the constants of the filters of single joints were chosen by. The ninth fits a network that comes with
-torchpose and lifts the keypoints of one camera.
+hips and legs are hidden to two cameras. The seventh hides joints in all cameras for some frames. The eighth
+tilts a camera that nobody calibrated. The ninth prints what the constants of the filters of single joints
+were chosen by. The tenth fits a network that comes with torchpose and lifts the keypoints of one camera.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ from benchmarks.keypoint_bodies.clips import (
     read_kinect,
 )
 from benchmarks.keypoint_bodies.desk import add_desk_table
+from benchmarks.keypoint_bodies.hidden import add_hidden_table
 from benchmarks.keypoint_bodies.lifting import fit_shipped, fit_upper_body
 from benchmarks.keypoint_bodies.lying import add_lying_table
 from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, OURS, Method, methods_of, takes
@@ -78,6 +80,7 @@ def main(
     sitting: bool = False,
     lying: bool = False,
     desk: bool = False,
+    hidden: bool = False,
     uncalibrated: bool = False,
     choose: bool = False,
     fit: Path | None = None,
@@ -97,6 +100,7 @@ def main(
         sitting: whether people sit, seen by one camera, in place of the tables.
         lying: whether people lie, seen by one camera, in place of the tables.
         desk: whether hips and legs are hidden to two cameras, in place of the tables; of methods `OURS`.
+        hidden: whether all cameras miss joints for some frames, in place of the tables; of `kalman` alone.
         uncalibrated: whether one camera is tilted and nobody has calibrated it, in place of the tables; with
             the lifters of methods beside the filter.
         choose: print the errors of several constants on the clips for that, in place of the tables.
@@ -112,6 +116,10 @@ def main(
     if desk:
         ours = [name for name in methods if name in OURS]
         add_desk_table(report, methods_of(ours, data, None, quick), data, quick)
+        print_tables(report, out)
+        return
+    if hidden:
+        add_hidden_table(report, data, quick)
         print_tables(report, out)
         return
     if uncalibrated:

@@ -25,6 +25,7 @@ from benchmarks.keypoint_bodies.clips import (
     read_kinect,
     see,
 )
+from benchmarks.keypoint_bodies.hidden import Gap, gaps_of, guesses, lines
 from benchmarks.keypoint_bodies.joint_filters import project_one
 from benchmarks.keypoint_bodies.lifters import placed
 from benchmarks.keypoint_bodies.lifting import fit_shipped, fit_upper_body
@@ -249,6 +250,40 @@ def test_quick_run_prints_people_behind_a_desk(run_here):
     for row in ("kalman", "mean pose", "still"):
         assert f"| {row}, {WALKS} |" in printed and f"| {row}, all |" in printed
     assert "pose2sim" not in printed  # knows nothing of joints that no camera sees
+
+
+@pytest.mark.slow
+def test_quick_run_prints_joints_that_are_hidden(run_here):
+    data = data_dir_or_skip(MHAD).parent
+    for name in (WALKS, ACTIONS):
+        data_dir_or_skip(name)
+    printed = run_here("keypoint_bodies.__main__", "--data", str(data), "--quick", "--hidden")
+    for row in ("seen", "hand, 6 frames", "everything, 6 frames"):
+        assert f"| 2 cameras, {row} |" in printed
+
+
+def test_gaps_hide_left_and_right_in_turn_and_end_before_the_clip():
+    gaps = gaps_of("arm", 15, 92)
+    assert [gap[:2] for gap in gaps] == [(20, 35), (53, 68)]
+    names = [[BODY_15.names[joint] for joint in gap.joints] for gap in gaps]
+    assert names == [["left_elbow", "left_wrist"], ["right_elbow", "right_wrist"]]
+
+
+def test_guesses_and_lines_are_exact_for_joints_that_move_evenly():
+    t = torch.arange(10, dtype=torch.float64)[:, None, None]
+    joints = torch.zeros(10, 15, 3, dtype=torch.float64) + t  # all move alike
+    hand = BODY_15.joint("left_wrist")
+    joints[:, hand] += t[:, 0] ** 2
+    gap = Gap(4, 7, (hand,))
+    room, pelvis, before = guesses(joints, gap)
+    assert room[:, 0, 0].tolist() == [12.0] * 3
+    assert pelvis[:, 0, 0].tolist() == before[:, 0, 0].tolist() == [13.0, 14.0, 15.0]
+    straight, relative = lines(joints, gap)
+    assert straight[:, 0, 0].tolist() == relative[:, 0, 0].tolist() == [23.0, 34.0, 45.0]
+    joints[5, BODY_15.joint("left_elbow")] += 1.0  # the joint before moves by itself
+    assert guesses(joints, gap)[2][:, 0, 0].tolist() == [13.0, 15.0, 15.0]
+    everything = gap._replace(joints=tuple(range(15)))
+    assert all(torch.equal(one, joints[3].expand(3, -1, -1)) for one in guesses(joints, everything))
 
 
 def test_turned_rings_see_the_same_body_from_other_sides(walker):

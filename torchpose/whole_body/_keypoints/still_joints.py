@@ -84,13 +84,11 @@ def with_still_joints(
 
 def _probability(speeds: Speeds) -> Float[Tensor, "B J"]:
     """Return how probable it is that joints stand still."""
-    still, moving = (_log_density(speeds, std) for std in (_STILL, _MOVING))
-    return (math.log(_PRIOR / (1 - _PRIOR)) + still - moving).sigmoid()
-
-
-def _log_density(speeds: Speeds, std: float) -> Float[Tensor, "B J"]:
-    """Return the log density of velocities, less a constant, by those of joints that move about."""
-    L = torch.linalg.cholesky(speeds.cov + std**2 * unit(3, speeds.cov))
-    off = torch.linalg.solve_triangular(L, speeds.velocity[..., None], upper=False)
+    stds = speeds.cov.new_tensor([_STILL, _MOVING])[:, None, None, None, None]
+    L = torch.linalg.cholesky(speeds.cov + stds.square() * unit(3, speeds.cov))
+    off = torch.linalg.solve_triangular(
+        L, speeds.velocity[..., None].expand(2, -1, -1, -1, -1), upper=False
+    )
     spread = L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return -0.5 * off.square().sum((-2, -1)) - spread
+    still, moving = -0.5 * off.square().sum((-2, -1)) - spread
+    return (math.log(_PRIOR / (1 - _PRIOR)) + still - moving).sigmoid()
