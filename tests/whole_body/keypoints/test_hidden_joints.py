@@ -9,7 +9,7 @@ import torchpose
 from tests.whole_body.keypoints.scenes import FPS, NAMES, Scene, errors, ring
 from torchpose.body import BODY_15, Body
 from torchpose.whole_body._keypoints.body_kalman import Speeds
-from torchpose.whole_body._keypoints.body_smoothing import from_last_seen
+from torchpose.whole_body._keypoints.body_smoothing import beginnings, from_last_seen
 from torchpose.whole_body._keypoints.still_joints import StillJoints
 
 J = BODY_15.joint
@@ -67,6 +67,18 @@ def test_jumps_count_from_the_frame_after_the_joint_was_last_seen():
     torch.testing.assert_close(moved, expected)
     started[0, 4] = True  # what is smoothed there does not reach any further back
     assert from_last_seen(jumped, seen, started, carriers)[0, 4, 0] == 3.0
+
+
+def test_smoothing_reaches_over_a_brief_absence_and_over_no_other_beginning():
+    def frames(*numbers):
+        return torch.isin(torch.arange(16), torch.tensor(numbers))[None]
+
+    # first, after three frames without anybody, in the frame after that, while seen, after five
+    started = frames(1, 5, 6, 8, 14)
+    coasting = frames(0, 2, 3, 4, 9, 10, 11, 12, 13)
+    assert beginnings(started, coasting, 4.0).nonzero()[:, 1].tolist() == [1, 8, 14]
+    past_the_end = frames(1, 5), frames(4, 5, 6)  # nothing is measured there
+    assert beginnings(*past_the_end, 4.0).nonzero()[:, 1].tolist() == [1, 5]
 
 
 def _speeds(velocity, std=0.1):

@@ -43,6 +43,28 @@ def from_last_seen(
     return (jumped * ~columns).scatter_add(1, first, jumped * columns)
 
 
+def beginnings(
+    started: Bool[Tensor, "B T"], coasting: Bool[Tensor, "B T"], longest: float
+) -> Bool[Tensor, "B T"]:
+    """Return frames in which tracking begins, so that they say nothing of the frames before.
+
+    Where it begins anew right after nothing was measured for a while, which happens in one camera, it is the
+    same person. Frames in a row in which it begins count as one.
+
+    Args:
+        started: frames in which tracking began. coasting: frames in which nothing was measured.
+        longest: frames without a measurement, at most, after which it is the same person.
+    """
+    frames = torch.arange(started.shape[1], device=started.device).expand_as(started)
+    measured = frames.where(~coasting, -1).cummax(1).values
+    unseen = torch.zeros_like(frames)
+    unseen[:, 1:] = (frames - measured)[:, :-1]
+    first = frames.where(~started, -1).cummax(1).values + 1
+    before = unseen.gather(1, first.clamp_max(started.shape[1] - 1))
+    again = started & ~coasting & (before > 0) & (before <= longest)
+    return started & ~(again & (started.cumsum(1) > 1))
+
+
 def smooth(
     filter: BodyKalmanFilter,
     filtered: BodyMoments,

@@ -27,7 +27,12 @@ from torchpose.whole_body._keypoints.body_kalman import (
     Widened,
 )
 from torchpose.whole_body._keypoints.body_size import SizeBelief
-from torchpose.whole_body._keypoints.body_smoothing import BodyMoments, from_last_seen, smooth
+from torchpose.whole_body._keypoints.body_smoothing import (
+    BodyMoments,
+    beginnings,
+    from_last_seen,
+    smooth,
+)
 from torchpose.whole_body._keypoints.faulty_cameras import (
     CameraFaults,
     corrected,
@@ -460,7 +465,7 @@ class KeypointTracker(nn.Module):
     # --- whole sequences --------------------------------------------------------------------------
 
     def smoothed(self, filtered: KeypointPoses, widened: Widened) -> KeypointPoses:
-        """Return poses for which later frames count too, up to where tracking began anew.
+        """Return poses for which later frames count too, up to where somebody was found anew.
 
         Args:
             filtered: with states of `to_be_smoothed`, which are written over. widened: as there [B, T, N].
@@ -470,7 +475,8 @@ class KeypointTracker(nn.Module):
         poses = filtered if self.only is None else self.only.as_last_told(filtered)
         states = BodyMoments(poses.point, poses.state_cov)
         wider = jumped + widened.carried
-        for rows, part in smooth(self.filter, states, wider, poses.started, poses.coasting):
+        begun = beginnings(poses.started, poses.coasting, self.filter.fps)
+        for rows, part in smooth(self.filter, states, wider, begun, poses.coasting):
             write_part(
                 _smoothed_fields(poses),
                 rows,
