@@ -20,10 +20,11 @@ from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_frame import LIMBS, SHOULDERS
-from torchpose.upper_body._articulated_poses import _trust
+from torchpose.upper_body._articulated_poses import _trust, _with_keypoints
 from torchpose.upper_body._articulated_root import RootStep
 from torchpose.upper_body._estimator import TrackerModel
 from torchpose.upper_body._lean import roll
+from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._root_grid import RootGrid
 from torchpose.upper_body._torso_likelihood import half_widths
 
@@ -569,39 +570,6 @@ def test_smoothing_sums_over_all_later_paths():
             torch.testing.assert_close(found[t].weight, brute(t, last))
 
 
-def test_what_is_known_of_an_arm_outlasts_frames_without_it():
-    """Its hypotheses go on for 0.2 s with their weights, and later frames are told to earlier ones."""
-    chain = ArticulatedFilter(TrackerModel(tracker(), PRIOR, tracker().measurement_cov, 30.0)).chain
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(10, 1, 2, 5, 2, 3, generator=generator, dtype=torch.float64)
-    directions = torch.nn.functional.normalize(directions, dim=-1).flatten(-2)
-    said = torch.rand(10, 1, 2, 5, generator=generator, dtype=torch.float64)
-    arms = [Arms(d[:, :, None], w.log()[:, :, None], torch.zeros_like(w)[:, :, None])
-            for d, w in zip(directions, said, strict=True)]  # fmt: skip
-    both, right = torch.tensor([[True, True]]), torch.tensor([[False, True]])
-    states = [chain.start(arms[0], both)]
-    for t in range(1, 9):
-        states.append(chain.update(states[-1], arms[t], right, told=right))
-    states.append(chain.update(states[-1], arms[9], both, told=both))
-    assert states[6].missed[0].tolist() == pytest.approx([0.2, 0.0])
-    for state in states[1:7]:
-        torch.testing.assert_close(state.weight[:, 0], states[0].weight[:, 0])
-        moved = (state.directions - directions[0])[:, 0].norm(dim=-1)
-        assert 0.0 < float(moved.mean()) < 0.5
-        assert float(state.log_evidence[0, 0]) == 0.0
-    for t in (7, 8, 9):
-        torch.testing.assert_close(states[t].directions[:, 0], directions[t, :, 0])
-    for t in range(10):
-        torch.testing.assert_close(states[t].directions[:, 1], directions[t, :, 1])
-    found = chain.smoothed(states[:7], None, None)
-    torch.testing.assert_close(found[3].weight[:, 0], states[0].weight[:, 0])  # nothing comes later
-    found = chain.smoothed([states[6]._replace(seen=both), *states[7:]], None, None)
-    later = chain.smoothed(states[5:], None, None)
-    message = found[0].weight[:, 0] / states[6].weight[:, 0]
-    passed = later[0].weight[:, 0] / states[5].weight[:, 0]
-    torch.testing.assert_close(message.pow(4) / message.pow(4).sum(), passed / passed.sum())
-
-
 def test_ellipsoids_grow_while_an_arm_is_not_measured():
     seen = pixels(body(60), 2.0)
     seen[30:50] = torch.nan
@@ -690,3 +658,32 @@ def test_smoothing_averages_the_noise_of_keypoints():
     rows = [ROW[f"elbow_{side}"] for side in ("left", "right")]
     off = [(found - pixels(joints))[:, rows].norm(dim=-1).mean() for found in (filtered, smoothed)]
     assert float(off[1]) < 0.8 * float(off[0])
+
+
+def test_a_measured_hand_is_seen_near_its_keypoint_though_bones_do_not_reach_it():
+    joints, hand = body(20), ROW["hand_left"]
+    shoulder = joints[:, ROW["shoulder_left"]]
+    joints[:, hand] = shoulder + torch.tensor([0.1, 0.5, 0.0])
+    joints[:, ROW["elbow_left"]] = (shoulder + joints[:, hand]) / 2
+    keypoints = pixels(joints, 2.0)
+    short = {"upper_arm": 0.22, "forearm": 0.2, "shoulder_width": 0.38, "head_height": 0.3}
+    found = tracker(bone_lengths=short)(keypoints[None], names=list(UPPER_BODY))
+    away = (pixels(found.joints3d[0]) - keypoints)[:, hand].norm(dim=-1)
+    seen = (found.joints2d[0] - keypoints)[:, hand].norm(dim=-1)
+    assert float(away.mean()) > 30 and float(seen.mean()) < 9
+    std = found.covariance2d[0, :, hand].diagonal(dim1=-2, dim2=-1).sqrt()
+    assert 2.0 < float(std.mean()) < 3.0  # less than that of the keypoint
+
+
+def test_pixels_of_measured_joints_are_products_of_two_gaussians():
+    generator = torch.Generator().manual_seed(0)
+    uv, z = torch.randn(2, 1, 5, 8, 2, generator=generator, dtype=torch.float64)
+    roots = torch.randn(2, 1, 5, 8, 2, 2, generator=generator, dtype=torch.float64)
+    covs, noise = roots @ roots.mT + 0.1 * torch.eye(2)
+    mask = torch.rand(1, 5, 8, generator=generator) < 0.6
+    mean, cov = _with_keypoints(uv, covs, MeasuredJoints(z, mask, noise))
+    precise = torch.linalg.inv(torch.linalg.inv(covs) + torch.linalg.inv(noise))
+    between = torch.linalg.solve(covs, uv[..., None]) + torch.linalg.solve(noise, z[..., None])
+    expected = (precise @ between)[..., 0]
+    torch.testing.assert_close(mean, torch.where(mask[..., None], expected, uv))
+    torch.testing.assert_close(cov, torch.where(mask[..., None, None], precise, covs))

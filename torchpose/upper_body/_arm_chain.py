@@ -10,10 +10,8 @@ from typing import NamedTuple, cast
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchpose._core.module_state import outside_inference
-from torchpose._core.rows import where_rows
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._arm_reach import loss_beyond_reach
 from torchpose.upper_body._direction_density import DirectionDensity
@@ -36,9 +34,6 @@ _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose h
 # Exponent of what later frames say of an arm whose hand is measured: they err as the frame itself does.
 _LATER = 0.25
 _RATE = 30.0
-_HELD = 0.22  # seconds for which hypotheses move along where nothing of an arm is measured
-_DRIFT = math.radians(3.0)  # step of these in a frame, at 30 frames a second
-_NEVER = 1e6  # seconds
 _LEAST = 1e-30  # density
 # Pairs of directions for each hypothesis from which on, and share of them at most of which, densities are
 # computed pair by pair.
@@ -114,7 +109,6 @@ class ArmState(NamedTuple):
         prior, predicted: the density of the prior, and that predicted from the frames before, at each
             hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
-        missed: for how many seconds nothing of each arm has been measured, [B, 2]; a million if it never was.
     """
 
     directions: Tensor
@@ -123,7 +117,6 @@ class ArmState(NamedTuple):
     prior: Tensor
     predicted: Tensor
     seen: Tensor
-    missed: Tensor
 
 
 class ArmChain:
@@ -137,11 +130,6 @@ class ArmChain:
     An arm whose hand is not measured moves less (s = 5 degrees, e = 0.02 at 30 frames a second, else 10 and
     0.2): what is not seen is best expected where it was. Above 30 frames a second steps are not smaller.
 
-    While nothing of an arm is measured for up to 0.2 s, each hypothesis keeps its weight and moves along by a
-    draw n of a Gaussian walk, x' = x + s (k^0.5 - (k - 1)^0.5) n in frame k of the gap (s = 3 degrees). The
-    nodes of two bones whose ends are not measured are 24 degrees apart, so most of what was known would be
-    lost on them.
-
     Args:
         density: the log-density of the prior over directions. fps: frames per second.
     """
@@ -153,7 +141,6 @@ class ArmChain:
         self.step, self.step_unseen = _STEP * math.sqrt(frames), _STEP_UNSEEN * math.sqrt(frames)
         self.anew = 1 - (1 - _ANEW) ** frames
         self.anew_unseen = 1 - (1 - _ANEW_UNSEEN) ** (_RATE / fps)
-        self.frame = 1 / fps
 
     def hypotheses(self, arm: ArmInput, angles: int = _ANGLES, around: int = _AROUND) -> Arms:
         """Return hypotheses that agree with the measurements of each arm, given each hypothesis of the root.
@@ -292,20 +279,15 @@ class ArmChain:
         tied = ((left @ self.density.together) * right).sum(-1)
         return arms.log_evidence.sum(1) + tied.log()
 
-    def start(
-        self, arms: Arms, seen: Bool[Tensor, "B 2"], told: Bool[Tensor, "B 2"] | None = None
-    ) -> ArmState:
+    @staticmethod
+    def start(arms: Arms, seen: Bool[Tensor, "B 2"]) -> ArmState:
         """Return the posterior after the first frame, given one hypothesis of the root.
 
         Args:
             arms: the hypotheses. seen: whether the hands are measured.
-            told: whether anything is known of each arm in this frame; None is both of everybody.
         """
         prior = arms.log_prior[:, :, 0].exp()
-        belief = _belief(arms, prior, prior, seen)
-        if told is None:
-            return belief
-        return belief._replace(missed=torch.where(told, belief.missed, _NEVER))
+        return _belief(arms, prior, prior, seen)
 
     def update(
         self,
@@ -313,41 +295,18 @@ class ArmChain:
         arms: Arms,
         seen: Bool[Tensor, "B 2"],
         again: Bool[Tensor, " B"] | None = None,
-        told: Bool[Tensor, "B 2"] | None = None,
     ) -> ArmState:
         """Return the posterior after one more frame; see `start`.
 
         Args:
             again: whose arms start again, as if it were their first frame; None is nobody.
-            told: as of `start`.
         """
         prior = arms.log_prior[:, :, 0].exp()
         moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0], seen)
         predicted = moved + self._anew(seen, prior) * (prior - moved)
         if again is not None:
             predicted = torch.where(again[:, None, None], prior, predicted)
-        belief = _belief(arms, prior, predicted, seen)
-        if told is None:
-            return belief
-        missed = state.missed + self.frame
-        if again is not None:
-            missed = missed.masked_fill(again[:, None], _NEVER)
-        missed = missed.masked_fill(told, 0.0)
-        moved_along = self._moved_along(state, missed)
-        return where_rows(_is_held(missed), moved_along, belief._replace(missed=missed))
-
-    @staticmethod
-    def _moved_along(state: ArmState, missed: Float[Tensor, "B 2"]) -> ArmState:
-        """Return the belief one frame later, of arms of which nothing is measured in it."""
-        length = _DRIFT * ((_RATE * missed).sqrt() - (_RATE * state.missed).sqrt())
-        draws = _draws(state.directions.shape[-2], missed.dtype, missed.device)
-        bones = (state.directions + length[..., None, None] * draws).unflatten(-1, (2, 3))
-        return state._replace(
-            directions=normalize(bones, dim=-1).flatten(-2),
-            log_evidence=torch.zeros_like(state.log_evidence),
-            seen=torch.zeros_like(state.seen),
-            missed=missed,
-        )
+        return _belief(arms, prior, predicted, seen)
 
     def _anew(self, seen: Bool[Tensor, "B 2"], like: Tensor) -> Float[Tensor, "B 2 1"]:
         """Return the share of each arm that is reinitialised in a frame."""
@@ -393,7 +352,6 @@ class ArmChain:
         moved = self._moved(ratio, later.directions, state.directions, later.seen)
         drawn = (later.prior * ratio).sum(-1, keepdim=True)
         message = moved + self._anew(later.seen, moved) * (drawn - moved)
-        message = torch.where(_is_held(later.missed)[..., None], after, message)
         return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
 
     def _moved(
@@ -509,21 +467,7 @@ def _belief(
     if arms.log_told is not None:
         evidence = torch.logsumexp(log_weight - arms.log_told[:, :, 0], -1)
     weight = (log_weight - total[..., None]).exp()
-    missed = torch.zeros_like(evidence)
-    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen, missed)
-
-
-def _is_held(missed: Float[Tensor, "B 2"]) -> Bool[Tensor, "B 2"]:
-    """Return of which arms hypotheses move along, by the time for which nothing of them has been measured."""
-    return (missed > 0) & (missed < _HELD)
-
-
-@cache
-def _draws(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "N 6"]:
-    """Return draws of a normal distribution, the same ones always."""
-    with outside_inference():
-        generator = torch.Generator().manual_seed(0)
-        return torch.randn(count, 6, generator=generator, dtype=dtype).to(device)
+    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen)
 
 
 def _axes_of_spheres(axes: Float[Tensor, "B M 3 3"]) -> Float[Tensor, "B 2 M 3 3"]:

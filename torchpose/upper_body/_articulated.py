@@ -59,6 +59,7 @@ from torchpose.upper_body._estimator import (
     TrackerModel,
     repeat_last,
 )
+from torchpose.upper_body._held_keypoints import Held, LastSeen, hold_hidden
 from torchpose.upper_body._lean import lean_angle, roll, seen_lean
 from torchpose.upper_body._lifted_arms import LiftedBones, lift
 from torchpose.upper_body._measured_joints import MeasuredJoints
@@ -113,6 +114,7 @@ class ArticulatedState(NamedTuple):
             several frames at a time.
         memory: what the network remembers that lifts bones, [B, L, W]; None before the first frame, and
             where shoulders and elbows are not among the keypoints.
+        last: where elbows and hands were last seen; None before the first frame.
     """
 
     root: Tensor
@@ -129,6 +131,7 @@ class ArticulatedState(NamedTuple):
     starts: Tensor | None
     told: _Told | None = None
     memory: Tensor | None = None
+    last: LastSeen | None = None
 
 
 class _Seen(NamedTuple):
@@ -280,14 +283,15 @@ class ArticulatedFilter(Estimator):
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         bones, memory = self._lifted(measured, state.memory)
-        steps, poses = self._steps(state, measured, bones, progress), []
+        held = hold_hidden(measured, state.last, self.model.rate)
+        steps, poses = self._steps(state, held, bones, progress), []
         while waiting := [*islice(steps, _AT_ONCE)]:
             state, told = waiting[-1].state, waiting[-1].state.told
             pose, told = self._poses([(step.seen, step.arms) for step in waiting], told)
             poses.append(pose)
             state = state._replace(told=told if len(waiting) == 1 else None)
-        state = state._replace(memory=memory)
-        return state, self._estimates(poses, len(measured.uv))
+        state = state._replace(memory=memory, last=held.last)
+        return state, self._estimates(poses, held.measured)
 
     def forward(
         self,
@@ -305,13 +309,14 @@ class ArticulatedFilter(Estimator):
             measured = averaged_over_frames(measured, lengths, self.ahead)
         state = self.init(len(measured.uv), joints, arm_generators)
         bones, _ = self._lifted(measured, None)
-        steps = self._steps(state, measured, bones, progress)
+        held = hold_hidden(measured, None, self.model.rate)
+        steps = self._steps(state, held, bones, progress)
         seen, arms = zip(*((step.seen, step.arms) for step in steps), strict=True)
         lag = int(smoothing) - self.ahead if isinstance(smoothing, int) else None
         found = list(zip(seen, self.chain.smoothed(arms, lengths, lag), strict=True))
         parts = (found[i : i + _AT_ONCE] for i in range(0, len(found), _AT_ONCE))
         poses = [self._poses(part)[0] for part in parts]
-        return repeat_last(self._estimates(poses, len(measured.uv)), lengths)
+        return repeat_last(self._estimates(poses, held.measured), lengths)
 
     def filtered(
         self,
@@ -339,14 +344,13 @@ class ArticulatedFilter(Estimator):
     def _steps(
         self,
         state: ArticulatedState,
-        measured: MeasuredJoints,
+        held: Held,
         bones: LiftedBones | None,
         progress: bool = False,
     ) -> Iterator[_Step]:
         """Yield the result of each frame."""
-        if self.middle_alone:
-            measured = with_middle(measured)
-        rays = as_rays(measured, self.optics, bones)
+        measured = with_middle(held.measured) if self.middle_alone else held.measured
+        rays = as_rays(measured, self.optics, bones, held.moved)
         facts = facts_of(rays, measured, self.optics.matrix)
         frames, batch_size = split(rays), len(measured.uv)
         with tqdm(total=len(frames), disable=not progress, desc="frames") as bar:
@@ -413,11 +417,11 @@ class ArticulatedFilter(Estimator):
         found = apart((arms, middle, shoulders, (middle @ tilt.mT)[:, 0]), len(frames))
         for frame, here, own in zip(frames, states, found, strict=True):
             own_arms, own_middle, own_shoulders, place = own
-            hands, told = frame.limbs[..., 1], _arms_told(frame, facts)
+            hands = frame.limbs[..., 1]
             belief = (
-                self.chain.start(own_arms, hands, told)
+                self.chain.start(own_arms, hands)
                 if belief is None
-                else self.chain.update(belief, own_arms, hands, again, told)
+                else self.chain.update(belief, own_arms, hands, again)
             )
             seen = _Seen(
                 frame, facts, here.tilt, state.sizes, state.lengths, before, state.moments, roots,
@@ -523,7 +527,7 @@ class ArticulatedFilter(Estimator):
             shoulders=seen.frame.torso[:, :2],
             limbs=seen.frame.seen,
             whole=seen.facts.whole,
-            lost=(False, False) in seen.facts.patterns,
+            moved=seen.frame.moved,
             exact=seen.frame.exact,
             std=torch.where(seen.frame.known, seen.frame.std, 0.0),
             lengths=seen.sizes.metres,
@@ -549,21 +553,15 @@ class ArticulatedFilter(Estimator):
             others = covs_of_roots(seen.roots, seen.sizes.metres)
         return _Told(seen.lengths, seen.before, bones, seen.roots, seen.sizes, others)
 
-    def _estimates(self, poses: Sequence[FramePose], batch_size: int) -> Estimates:
-        return estimates_of(poses, batch_size, self.optics.matrix, self.lengths.names)
+    def _estimates(self, poses: Sequence[FramePose], measured: MeasuredJoints) -> Estimates:
+        return estimates_of(
+            poses, len(measured.uv), self.optics.matrix, self.lengths.names, measured
+        )
 
 
 def _none_if_nobody(chosen: Tensor) -> Tensor | None:
     """Return the same; None if it is false or 0 for everybody."""
     return chosen if bool(chosen.any()) else None
-
-
-def _arms_told(frame: RayFrame, facts: Facts) -> Bool[Tensor, "B 2"] | None:
-    """Return whether a frame tells anything of each arm; None if it does of both of everybody."""
-    if (False, False) not in facts.patterns:
-        return None
-    measured = frame.limbs.any(-1)
-    return measured if frame.log_inside is None else measured | (frame.log_inside < 0)
 
 
 @cache

@@ -71,6 +71,8 @@ class RayFrame(NamedTuple):
         seen: as limbs, but those that were put into gaps not, [B, 2, 2].
         log_inside: see `Absence`, 0 where a hand is measured, [B, 2]; None without any evidence.
         told: k of lifted bones (`LiftedBones`), [B, 5]; None without any.
+        moved: the variance of how far elbow and hand of both arms have moved since they were seen
+            (`hold_hidden`), metres squared, [B, 2, 2]; None without any.
     """
 
     rays: Tensor
@@ -88,6 +90,7 @@ class RayFrame(NamedTuple):
     seen: Tensor
     log_inside: Tensor | None = None
     told: Tensor | None = None
+    moved: Tensor | None = None
 
 
 class Facts(NamedTuple):
@@ -152,12 +155,17 @@ def upright(frame: RayFrame, facts: Facts, tilt: Float[Tensor, "B 3 3"]) -> Upri
     return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts, borders, bones)
 
 
-def as_rays(measured: MeasuredJoints, optics: Optics, bones: LiftedBones | None = None) -> RayFrame:
+def as_rays(
+    measured: MeasuredJoints,
+    optics: Optics,
+    bones: LiftedBones | None = None,
+    moved: Float[Tensor, "B T 2 2"] | None = None,
+) -> RayFrame:
     """Return the measurements of T frames as rays, [B, T, ...].
 
     Args:
         measured: the measurements, [B, T, ...]. optics: those of the prior's camera.
-        bones: what a network tells of them, or None.
+        bones: what a network tells of them, or None. moved: as in `RayFrame`.
     """
     known, rows = measured.mask, index_tensor(_ROWS, measured.mask.device)
     rays = pad(measured.uv, (0, 1), value=1.0) @ optics.inverse.mT
@@ -181,7 +189,7 @@ def as_rays(measured: MeasuredJoints, optics: Optics, bones: LiftedBones | None 
         torch.cat(parts, -2), known, std, exact, torso, std.index_select(-1, rows[_TORSO]), lifted,
         limbs, *_noise_along(std, known), (torso.sum(-1) > 1) & ~limbs[..., 0].any(-1),
         None if face is None else face.confidence, seen, _log_inside(measured),
-        None if bones is None else bones.precision,
+        None if bones is None else bones.precision, moved,
     )  # fmt: skip
 
 

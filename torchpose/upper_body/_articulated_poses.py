@@ -11,10 +11,12 @@ from torch import Tensor
 
 from torchpose._core.module_state import index_tensor
 from torchpose.filters._outputs import FilterOutput, first_not_finite
+from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmState, mirrored
 from torchpose.upper_body._articulated_frame import HANDS, LIMBS, SHOULDERS
 from torchpose.upper_body._estimator import Bones, Estimates, SeenPoses
+from torchpose.upper_body._measured_joints import MeasuredJoints
 
 _NECK = UPPER_BODY.index("neck")
 _STD = 0.03  # metres: of every joint in space
@@ -23,9 +25,6 @@ _NOISE = 0.02  # metres: of that, the noise of keypoints
 # full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
 # Other covariances hold as they are, with detectors' errors too.
 _WHOLE, _HAND_ALONE = 0.55, 0.75
-# Metres per second along every axis, of elbows and hands that are not seen, and seconds after which the
-# hypotheses themselves have spread.
-_UNSEEN_SPEEDS, _UNSEEN_TIME = (0.45, 0.9), 0.7
 _ROUNDS = 3  # in which bones of given lengths are fitted to elbow and hand
 
 
@@ -35,7 +34,8 @@ class SeenBody(NamedTuple):
     Attributes:
         joints: shoulders, neck and head, metres, [B, 8, 3]; the others are 0.
         shoulders: whether these are measured, [B, 2]. limbs: whether elbow and hand of both arms are,
-            [B, 2, 2]. whole: whether both of any arm are. lost: whether neither of any arm is.
+            [B, 2, 2]. whole: whether both of any arm are.
+        moved: as of `RayFrame`.
         exact: whether every keypoint has full confidence, [B].
         std: the standard deviation of a pixel over the focal length, 0 where no joint is measured, [B, 8].
         lengths: the lengths of the bones, metres, [B, 4]. bones: the same as they are reported, with
@@ -51,7 +51,7 @@ class SeenBody(NamedTuple):
     shoulders: Tensor
     limbs: Tensor
     whole: bool
-    lost: bool
+    moved: Tensor | None
     exact: Tensor
     std: Tensor
     lengths: Tensor
@@ -132,8 +132,9 @@ def pose_of(
     trust = trust if calibrated else torch.ones_like(trust)
     trust = trust.repeat_interleave(2, 1)[..., None, None]
     spread = spread.flatten(1, 2)
-    if body.lost:
-        spread = spread + _moved_unseen(belief.missed)
+    if body.moved is not None:
+        eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+        spread = spread + body.moved.flatten(1)[..., None, None] * eye
     covs, of_limbs = _covs(body, joints, spread, trust)
     mean_covs = covs.index_copy(1, rows, of_limbs)
     posterior = joints, mean_covs
@@ -151,20 +152,6 @@ def pose_of(
     return FramePose(
         *pose, *seen, body.tilt @ axes.mT, evidence, log_weights, body.bones.metres, body.bones.covs
     )
-
-
-def _moved_unseen(missed: Float[Tensor, "B 2"]) -> Float[Tensor, "B 4 3 3"]:
-    """Return the covariances of how far elbows and hands have moved since their arms were measured.
-
-    People move on, and hypotheses about their arms stand still until they are drawn anew: the standard
-    deviation along every axis is v t / (1 + (t / T)^2).
-
-    Args:
-        missed: t, seconds.
-    """
-    far = missed / (1 + (missed / _UNSEEN_TIME).square())
-    variance = torch.stack([speed * far for speed in _UNSEEN_SPEEDS], -1).square().flatten(1)
-    return variance[..., None, None] * torch.eye(3, dtype=missed.dtype, device=missed.device)
 
 
 def enlarged(pose: FramePose, factor: float) -> FramePose:
@@ -259,19 +246,23 @@ def estimates_of(
     batch_size: int,
     matrix: Float[Tensor, "3 3"],
     names: tuple[str, ...],
+    measured: MeasuredJoints,
 ) -> Estimates:
     """Return the estimates of both arms and the poses they were made from.
 
     Args:
         poses: the poses of some frames of all B sequences at a time, [B T', ...]. batch_size: B.
         matrix: K of the prior's camera. names: the names of the bone lengths.
+        measured: the measurements of these frames.
     """
     stacked = FramePose(*(_of_sequences(values, batch_size) for values in zip(*poses, strict=True)))
     neck = stacked.joints[:, :, _NECK]
-    # measured joints are seen where they are measured, though bones that are unsure keep their lengths
     seen = stacked.means @ matrix.mT
-    uv = seen[..., :2] / seen[..., 2:]
-    uv_covs = _pixel_covs(stacked.means, stacked.mean_covs, matrix)
+    uv, uv_covs = _with_keypoints(
+        seen[..., :2] / seen[..., 2:],
+        _pixel_covs(stacked.means, stacked.mean_covs, matrix),
+        measured,
+    )
     joints = stacked.joints.flatten(2)
     failed_at = first_not_finite(joints)
     left, right = (
@@ -292,6 +283,26 @@ def _of_sequences(values: Sequence[Tensor], batch_size: int) -> Tensor:
     """Return values of some frames of all sequences at a time, [B T', ...], as those of all frames."""
     parts = [value.unflatten(0, (batch_size, -1)) for value in values]
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def _with_keypoints(
+    uv: Float[Tensor, "B T 8 2"], covs: Float[Tensor, "B T 8 2 2"], measured: MeasuredJoints
+) -> tuple[Float[Tensor, "B T 8 2"], Float[Tensor, "B T 8 2 2"]]:
+    """Return pixels and covariances of joints, updated once more by the keypoints of those that are measured.
+
+    Bones whose lengths are unsure may not reach a keypoint. A joint in space keeps them, its pixel does not:
+
+        u' = u + K (z - u),   S' = K R,   K = S (S + R)^-1
+
+    Args:
+        uv, covs: u and S, of bones that keep their lengths. measured: z and R.
+    """
+    factor = safe_cholesky(covs + measured.cov)
+    gain = torch.cholesky_solve(covs, factor).mT
+    moved = (gain @ (measured.uv - uv)[..., None])[..., 0]
+    known = measured.mask[..., None]
+    nearer = symmetrise(gain @ measured.cov)
+    return torch.where(known, uv + moved, uv), torch.where(known[..., None], nearer, covs)
 
 
 def _pixel_covs(
