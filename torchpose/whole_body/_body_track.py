@@ -134,8 +134,9 @@ class BodyTrack:
             path: the file, which is replaced if there is one.
 
         Raises:
-            OutputError: the file cannot be written.
+            InputError: a frame before tracking began. OutputError: the file cannot be written.
         """
+        self._check_begun()
         arrays: dict[str, Any] = {
             name: getattr(self, name).detach().cpu().numpy() for name in _FRAMES
         }
@@ -196,6 +197,16 @@ class BodyTrack:
         poses._check(path)
         return poses
 
+    def _check_begun(self) -> None:
+        """Raise `InputError` where there is no pose, as live before tracking begins."""
+        there = self.state.isfinite().all(-1)
+        if not bool(there.all()):
+            first = self.first_frame + int((~there).nonzero()[0])
+            raise InputError(
+                f"frame {first} holds no pose, since tracking had not begun; write only live frames whose "
+                "joints3d are finite"
+            )
+
     def _check(self, path: str | Path) -> None:
         """Raise unless the values agree with one another; the types and shapes do."""
         check_estimates(path, "joints3d", self.joints3d, self.covariance3d)
@@ -253,8 +264,10 @@ class BodyTrack:
                 axes of the world.
 
         Raises:
-            InputError: another suffix or axis. OutputError: the file cannot be written.
+            InputError: another suffix or axis, or a frame before tracking began. OutputError: the file
+                cannot be written.
         """
+        self._check_begun()
         motion = BodyMotion3d(
             self.body, self.state, self.joints3d, self.joints_std(), self.fps or _FPS,
             self.first_frame, self.feet,

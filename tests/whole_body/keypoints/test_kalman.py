@@ -405,7 +405,7 @@ def test_cameras_of_a_late_track_are_refined_from_its_beginning():
     assert len(found.details["camera_delays"]) == 12
 
 
-def test_live_there_is_no_pose_before_the_first(four):
+def test_live_there_is_no_pose_before_the_first(four, tmp_path):
     live = tracker(four.rig)
     nothing = torch.full_like(four.keypoints[0], math.nan)
     state, before = live.step(live.init(), keypoints=nothing)
@@ -414,6 +414,10 @@ def test_live_there_is_no_pose_before_the_first(four):
         assert getattr(before, name).isnan().all() and getattr(begun, name).isfinite().all()
     assert bool(before.coasting) and not bool(begun.coasting)
     assert [len(before), begun.first_frame] == [1, 1]
+    for write in (before.save, before.export):
+        with pytest.raises(InputError, match="frame 0 holds no pose, since tracking had not begun"):
+            write(tmp_path / "before.trc")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_who_is_never_seen_well_enough_is_nobody():
