@@ -88,11 +88,12 @@ def hold_hidden(measured: MeasuredJoints, last: LastSeen | None, rate: float) ->
         measured: T more frames. last: where arms were last seen; None before the first frame.
         rate: frames per second.
     """
-    places, cov, known = (
-        _of_arms(values) for values in (measured.uv, _cov(measured), measured.mask)
+    known, places = _of_arms(measured.mask), _of_arms(measured.uv)
+    now = LastSeen(
+        places, _starts(measured), _of_arms(_cov(measured)), torch.zeros_like(places[..., 0])
     )
-    now = LastSeen(places, _starts(measured), cov, known)
-    seen = _last_seen(now, LastSeen.never(measured) if last is None else last, rate)
+    before = LastSeen.never(measured) if last is None else last
+    seen = _last_seen(now, known, before, rate)
     last = LastSeen(*(values[:, -1] for values in seen))
     gone = ~known[..., 1:]
     if not bool(gone[..., 1].any()):
@@ -123,18 +124,18 @@ def _starts(measured: MeasuredJoints) -> Float[Tensor, "B T 2 3 2"]:
     return torch.cat([neck, _of_arms(places)[..., :-1, :]], -2)
 
 
-def _last_seen(now: LastSeen, before: LastSeen, rate: float) -> LastSeen:
+def _last_seen(
+    now: LastSeen, known: Bool[Tensor, "B T 2 3"], before: LastSeen, rate: float
+) -> LastSeen:
     """Return where arms were last seen in each of T frames, [B, T, 2, 3, ...].
 
     Args:
-        now: what is measured in each frame, whose `time` is whether it is. before: before the first frame.
-        rate: frames per second.
+        now: what is measured in each frame. known: whether it is. before: where arms were last seen before
+            the first frame. rate: frames per second.
     """
-    known = now.time
     if known.shape[1] == 1:
         older = before._replace(time=before.time + 1 / rate)
-        newer = now._replace(time=torch.zeros_like(known, dtype=older.time.dtype))
-        return where_rows(known, newer, LastSeen(*(values[:, None] for values in older)))
+        return where_rows(known, now, LastSeen(*(values[:, None] for values in older)))
     frames = torch.arange(1, known.shape[1] + 1, device=known.device)[:, None, None]
     found = torch.where(known, frames, 0).cummax(1).values
 
@@ -142,13 +143,8 @@ def _last_seen(now: LastSeen, before: LastSeen, rate: float) -> LastSeen:
         rows = found.view(*found.shape, *[1] * (values.ndim - found.ndim)).expand_as(values)
         return torch.cat([first[:, None], values], 1).gather(1, rows)
 
-    since = (frames - found).to(before.time) / rate
-    return LastSeen(
-        at(before.places, now.places),
-        at(before.starts, now.starts),
-        at(before.cov, now.cov),
-        torch.where(found > 0, since, since + before.time[:, None]),
-    )
+    kept = LastSeen(*(at(*pair) for pair in zip(before, now, strict=True)))
+    return kept._replace(time=kept.time + (frames - found).to(kept.time) / rate)
 
 
 def _places(
