@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -292,8 +293,11 @@ def _with_joints(data: Keypoints) -> Keypoints:
     )
 
 
-def is_filled(points: np.ndarray) -> np.ndarray:
-    """Return which keypoints [..., 2] are (0, 0) or (-1, -1), what files have where nothing was found."""
+_Points = TypeVar("_Points", np.ndarray, Tensor)
+
+
+def is_filled(points: _Points) -> _Points:
+    """Return which keypoints [..., 2] are (0, 0) or (-1, -1), as detectors write where nothing was found."""
     return (points == 0).all(-1) | (points == -1).all(-1)
 
 

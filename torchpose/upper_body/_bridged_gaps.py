@@ -74,12 +74,11 @@ def bridged_over_gaps(
         gaps.inside[..., HANDS] &= measured.absence.log_inside >= 0
     if not bool(gaps.inside.any()):
         return measured
-    cov = measured.cov.expand(*gaps.inside.shape, 2, 2)
     middle, body, face = measured.middle, measured.body, measured.face
     return measured._replace(
         uv=_bridged_places(measured, gaps),
         mask=measured.mask | gaps.inside,
-        cov=_filled(cov, gaps, _NOISE),
+        cov=_filled(measured.cov_of_frames, gaps, _NOISE),
         middle=None if middle is None else _bridged_middle(middle, inside[..., 0], rate),
         body=None if body is None else _bridged_points(body, inside, rate),
         face=None if face is None else _bridged_points(face, inside, rate),

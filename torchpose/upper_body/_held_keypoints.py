@@ -90,7 +90,10 @@ def hold_hidden(measured: MeasuredJoints, last: LastSeen | None, rate: float) ->
     """
     known, places = _of_arms(measured.mask), _of_arms(measured.uv)
     now = LastSeen(
-        places, _starts(measured), _of_arms(_cov(measured)), torch.zeros_like(places[..., 0])
+        places,
+        _starts(measured),
+        _of_arms(measured.cov_of_frames),
+        torch.zeros_like(places[..., 0]),
     )
     before = LastSeen.never(measured) if last is None else last
     seen = _last_seen(now, known, before, rate)
@@ -111,10 +114,6 @@ def hold_hidden(measured: MeasuredJoints, last: LastSeen | None, rate: float) ->
 def _of_arms(values: Tensor) -> Tensor:
     """Return values of all joints, [B, T, 8, ...], as those of both arms, [B, T, 2, 3, ...]."""
     return values.index_select(2, index_tensor(_ARMS, values.device)).unflatten(2, (2, 3))
-
-
-def _cov(measured: MeasuredJoints) -> Float[Tensor, "B T 8 2 2"]:
-    return measured.cov.expand(*measured.mask.shape, 2, 2)
 
 
 def _starts(measured: MeasuredJoints) -> Float[Tensor, "B T 2 3 2"]:
@@ -185,7 +184,7 @@ def _filled(
     return measured._replace(
         uv=put(measured.uv, seen.places),
         mask=put(measured.mask, held),
-        cov=put(_cov(measured), _NOISE * seen.cov),
+        cov=put(measured.cov_of_frames, _NOISE * seen.cov),
         bridged=put(
             torch.zeros_like(measured.uv[..., 0]) if bridged is None else bridged, variance
         ),

@@ -91,6 +91,11 @@ class MeasuredJoints(NamedTuple):
         """Return which joints are measured, those not that were put into gaps."""
         return self.mask if self.bridged is None else self.mask & (self.bridged == 0)
 
+    @property
+    def cov_of_frames(self) -> Float[Tensor, "B T 8 2 2"]:
+        """Return R of each joint in each frame."""
+        return self.cov.expand(*self.mask.shape, 2, 2)
+
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
     """Return the scale of the prior's camera at the neck of its mean pose; computed once for each prior."""
@@ -278,7 +283,7 @@ def in_level_pixels(
     if turn is None:
         return measured
     uv, mask = measured.uv, measured.mask & turn.visible(measured.uv, matrix)
-    cov = measured.cov.expand(*uv.shape[:2], *measured.cov.shape[-3:])
+    cov = measured.cov_of_frames
     cov = torch.where(mask[..., None, None], turn.covariances(cov, uv), cov)
     turned = torch.where(mask[..., None], turn.points(uv), torch.zeros_like(uv))
     face = measured.face

@@ -305,7 +305,7 @@ def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
     )
     if new.cov is frames.cov:
         return MeasuredJoints(uv, mask, new.cov)
-    covs = torch.cat([_cov_of_frames(frames), _cov_of_frames(new)], 1)
+    covs = torch.cat([frames.cov_of_frames, new.cov_of_frames], 1)
     return MeasuredJoints(uv, mask, covs)
 
 
@@ -313,11 +313,6 @@ def _last(frames: MeasuredJoints, count: int) -> MeasuredJoints:
     """Return the last frames, at most `count`."""
     cov = frames.cov if frames.cov.ndim == 3 else frames.cov[:, -count:]
     return MeasuredJoints(frames.uv[:, -count:], frames.mask[:, -count:], cov)
-
-
-def _cov_of_frames(measured: MeasuredJoints) -> Float[Tensor, "B T 8 2 2"]:
-    """Return R of each joint in each frame."""
-    return measured.cov.expand(*measured.uv.shape[:2], *measured.cov.shape[-3:])
 
 
 def _window_filter(

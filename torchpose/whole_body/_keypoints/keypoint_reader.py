@@ -19,6 +19,7 @@ from torchpose.body._feet import foot_points
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError, ShapeError
+from torchpose.io._keypoints import is_filled
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
@@ -72,8 +73,7 @@ class KeypointReader:
         points = keypoints.to(self.rig.matrix)
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
         trust = trust.nan_to_num(0.0)
-        filled = (points == 0).all(-1) | (points == -1).all(-1)  # where detectors found nothing
-        known = torch.isfinite(points).all(-1) & ~filled
+        known = torch.isfinite(points).all(-1) & ~is_filled(points)
         outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
         if bool(outside.any()):
             raise InputError(
@@ -150,9 +150,11 @@ class KeypointReader:
         They are to the right of it and below it, and hardly anywhere else. Hidden legs that a detector puts
         below an image are hardly to the right of it.
         """
-        size = self.rig.sizes[0]
-        weights = table[..., 4].nan_to_num(0.0)
-        if size is None or int((weights > 0).sum()) < _MANY:
+        size, weights = self.rig.sizes[0], table[..., 4]
+        if size is None or weights.numel() < _MANY:  # of few frames nothing is computed, as live
+            return
+        weights = weights.nan_to_num(0.0)
+        if int((weights > 0).sum()) < _MANY:
             return
         height, width = size
         u, v = _pixels_of(table).unbind(-1)

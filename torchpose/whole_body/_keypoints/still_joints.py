@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.math._gaussian import log_prob
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter, Speeds
 from torchpose.whole_body._keypoints.information_step import unit
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
@@ -86,9 +87,6 @@ def _probability(speeds: Speeds) -> Float[Tensor, "B J"]:
     """Return how probable it is that joints stand still."""
     stds = speeds.cov.new_tensor([_STILL, _MOVING])[:, None, None, None, None]
     L = torch.linalg.cholesky(speeds.cov + stds.square() * unit(3, speeds.cov))
-    off = torch.linalg.solve_triangular(
-        L, speeds.velocity[..., None].expand(2, -1, -1, -1, -1), upper=False
-    )
-    spread = L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    still, moving = -0.5 * off.square().sum((-2, -1)) - spread
+    nothing = torch.zeros_like(speeds.velocity)
+    still, moving = log_prob(nothing, speeds.velocity, L)
     return (math.log(_PRIOR / (1 - _PRIOR)) + still - moving).sigmoid()
