@@ -37,9 +37,6 @@ from torchpose.metrics import coverage
 from torchpose.skeleton._joint_sets import canonical_names
 
 _UTD, _BURKE, _LABAN, _MHAD = NAMES
-_UTD_EVERY = 8  # one recording of so many
-METHODS = ("articulated", "multiple-model", "window-mixture", "mkf-fixed")
-"""Methods of which the table is printed."""
 _SETS = {
     "s5 and s6 of UTD-MHAD": (_UTD, ("s5", "s6")),
     "kinect_laban": (_LABAN, ()),
@@ -196,16 +193,14 @@ def left_out(data: Path, quick: bool) -> Iterator[tuple[str, Unseen]]:
             continue
         unseen = known[folder] = known.get(folder) or leave_out(data, folder, quick, ())
         if persons:
-            chosen = [r for r in bones.recordings(data / folder) if r.person in persons]
-            joints = [r.upper_body().joints.double() for r in chosen[::_UTD_EVERY]]
-            unseen = unseen._replace(views=bones.seen_by_camera(joints))
+            unseen = unseen._replace(views=bones.kinect_views(data, persons=persons))
         yield name, unseen
 
 
 def main(
     *,
     data: Path,
-    method: Annotated[str, OneOf(METHODS)] = "articulated",
+    method: Annotated[str, OneOf(bones.METHODS)] = "articulated",
     smoothed: bool = False,
     every: int = 1,
     threads: int = 2,

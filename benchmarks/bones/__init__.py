@@ -2,6 +2,7 @@
 
 from benchmarks.bones.fits import SETS, fit_without
 from benchmarks.bones.scoring import (
+    METHODS,
     Chains,
     errors,
     lifted,
@@ -18,6 +19,7 @@ from benchmarks.bones.views import (
     View,
     arm_rows,
     begun,
+    kinect_views,
     mhad_views,
     openpose_views,
     recordings,
@@ -29,6 +31,7 @@ __all__ = [
     "FEW",
     "FIT",
     "FOUR",
+    "METHODS",
     "SETS",
     "Chains",
     "View",
@@ -36,6 +39,7 @@ __all__ = [
     "begun",
     "errors",
     "fit_without",
+    "kinect_views",
     "lifted",
     "lifts",
     "limbs",

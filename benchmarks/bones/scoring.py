@@ -117,11 +117,22 @@ def true_lengths(view: View) -> Float[Tensor, "2 2"]:
     return view.truth.diff(dim=2).norm(dim=-1).nanmean(0)
 
 
+_KNOWS_ARMS = {
+    "window-mixture": False,
+    "articulated": True,
+    "multiple-model": True,
+    "mkf-fixed": False,
+}
+METHODS = tuple(_KNOWS_ARMS)
+"""Methods that are compared."""
+
+
 def trackers(arms: ArmPrior) -> dict[str, dict[str, object]]:
     """Return the options of the trackers that are compared, by the method's name."""
-    own = {"window-mixture": {}, "articulated": {"arms": arms}, "multiple-model": {"arms": arms},
-           "mkf-fixed": {}}  # fmt: skip
-    return {name: {"method": name, **options} for name, options in own.items()}
+    return {
+        name: {"method": name, **({"arms": arms} if knows else {})}
+        for name, knows in _KNOWS_ARMS.items()
+    }
 
 
 def lifts(mean: Float[Tensor, "2 2"]) -> dict[str, Callable[[View], Chains]]:

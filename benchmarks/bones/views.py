@@ -177,13 +177,15 @@ def recordings(folder: Path) -> list[Recording]:
     return read_recordings(folder)
 
 
-def kinect_views(data: Path, every: int = UTD_EVERY) -> list[View]:
-    """Return sequences of s7 and s8 of UTD-MHAD in the test camera of UB-people, 3 px of noise.
+def kinect_views(
+    data: Path, every: int = UTD_EVERY, persons: Sequence[str] = UTD_PERSONS
+) -> list[View]:
+    """Return sequences of some persons of UTD-MHAD in the test camera of UB-people, 3 px of noise.
 
     Args:
-        data: folder with kinect_utd_mhad/. every: one sequence in so many.
+        data: folder with kinect_utd_mhad/. every: one sequence in so many. persons: by default s7 and s8.
     """
-    chosen = [r for r in recordings(data / UTD) if r.person in UTD_PERSONS][::every]
+    chosen = [r for r in recordings(data / UTD) if r.person in persons][::every]
     return seen_by_camera([r.upper_body().joints.double() for r in chosen])
 
 

@@ -240,8 +240,13 @@ def see(clip: MocapClip, seed: int = 0, faults: Faults = FAULTS, turn: float = 0
 
 def begun(clip: Clip, frames: int = _QUICK_FRAMES) -> Clip:
     """Return the first frames of a clip."""
-    seen = Detections(*(values[:frames] for values in clip.seen))
-    return clip._replace(joints=clip.joints[:frames], seen=seen)
+    return cut(clip, slice(frames))
+
+
+def cut(clip: Clip, frames: slice) -> Clip:
+    """Return some frames of a clip."""
+    seen = Detections(*(values[frames] for values in clip.seen))
+    return clip._replace(joints=clip.joints[frames], seen=seen)
 
 
 # --- cameras

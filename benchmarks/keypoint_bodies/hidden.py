@@ -20,7 +20,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 import torchpose
-from benchmarks.keypoint_bodies.clips import NOISE_ALONE, SCORED, Clip, Detections, read_clips
+from benchmarks.keypoint_bodies.clips import NOISE_ALONE, SCORED, Clip, cut, read_clips
 from benchmarks.keypoint_bodies.scoring import Estimate, from_the_start
 from torchpose.body import BODY_15
 from torchpose.evaluation import Report
@@ -170,9 +170,7 @@ def _seen_before(joint: int, hidden: Sequence[int]) -> int:
 def _middle(clip: Clip, frames: int) -> Clip:
     """Return the frames in the middle of a clip."""
     start = max(0, (len(clip.joints) - frames) // 2)
-    cut = slice(start, start + frames)
-    seen = Detections(*(values[cut] for values in clip.seen))
-    return clip._replace(joints=clip.joints[cut], seen=seen)
+    return cut(clip, slice(start, start + frames))
 
 
 def _scored(clip: Clip, lengths: Sequence[int]) -> dict[str, list[float]]:
