@@ -99,6 +99,17 @@ def test_one_outlier_moves_nobody(with_one_outlier, clean, hidden, which):
     assert float((track.joints3d[rows] - hidden(joint).joints3d).norm(dim=-1).max()) < 1e-9
 
 
+@pytest.mark.parametrize("filled", [0.0, -1.0])
+def test_what_detectors_write_where_they_found_nothing_is_missing(
+    tracker, keypoints, hidden, filled
+):
+    given = keypoints.clone()
+    given[:, FRAME, NAMES.index("hand_left")] = filled
+    track, expected = tracker(given, names=NAMES), hidden("hand_left")
+    assert torch.equal(track.joints3d, expected.joints3d) and track.notes == expected.notes
+    assert bool(track.inlier_probability[:, FRAME, UPPER_BODY.index("hand_left")].isnan().all())
+
+
 def test_outliers_are_counted_in_a_note(with_one_outlier):
     (note,) = [note for note in with_one_outlier.notes if "outlier" in note]
     assert note.startswith("48 keypoints") and all(f"{joint} 12" in note for joint in NAMES)

@@ -25,6 +25,7 @@ from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
+from torchpose.io._keypoints import is_filled
 from torchpose.math._gaussian import block_diagonal
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -183,18 +184,18 @@ def measured_keypoints(
     """Return which keypoints are measured.
 
     Args:
-        keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
-            missing. mask: [B, T, J], False = ignore, or None.
+        keypoints: NaN where missing, or exactly (0, 0) or (-1, -1) as many detectors write. confidence:
+            [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is missing. mask: [B, T, J], False = ignore,
+            or None.
 
     Raises:
         InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
         ShapeError: confidence or mask do not fit the keypoints.
     """
-    if seen_finite(keypoints):
-        measured = torch.ones_like(keypoints[..., 0], dtype=torch.bool)
-    else:
+    measured = ~is_filled(keypoints)
+    if not seen_finite(keypoints):
         check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
-        measured = torch.isfinite(keypoints).all(-1)
+        measured = measured & torch.isfinite(keypoints).all(-1)
     check_tensors(mask=mask)
     if mask is not None:
         check_shape("mask", mask, list(measured.shape))

@@ -265,7 +265,8 @@ class UpperBodyTracker(WideModule):
         """Track a batch of sequences.
 
         Args:
-            keypoints: [B, T, J, 2], pixels of the camera; NaN where one is missing.
+            keypoints: [B, T, J, 2], pixels of the camera; NaN where one is missing, or exactly (0, 0) or
+                (-1, -1), as many detectors write.
             confidence: [B, T, J], 0 to 1, by which the measurement covariance is divided, and by which a
                 keypoint may be an outlier (docs/mathematics.md, "Outliers"); 0 or NaN where it is missing.
             names: the names of the J joints, in any order and spelling of `torchpose.skeleton`;
