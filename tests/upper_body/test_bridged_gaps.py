@@ -10,11 +10,11 @@ from torchpose.filters._outputs import FilterOutput
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body._absence import Absence
 from torchpose.upper_body._bridged_gaps import bridged_over_gaps
-from torchpose.upper_body._estimator import Estimates
+from torchpose.upper_body._estimator import Estimates, SeenPoses
 from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._lifted_arms import BodyPoints
 from torchpose.upper_body._measured_joints import MeasuredJoints, MiddlePoint
-from torchpose.upper_body._multiple_models import _log_ratios
+from torchpose.upper_body._multiple_models import _clues
 
 RATE = 30.0
 SHOULDER, ELBOW, HAND, HEAD = (
@@ -154,6 +154,8 @@ def test_keypoints_in_gaps_do_not_weigh_models():
 
     ones, none = torch.ones(1, 30).double(), torch.full((1,), -1)
     arm = FilterOutput(ones[..., None], ones[..., None], ones, None, none)
-    found = Estimates(arm, arm)
-    counted = _log_ratios(found, found, bridged)[0, :, 1]
+    joints = torch.rand(1, 30, 8, 3, dtype=torch.float64)
+    poses = SeenPoses(joints, *6 * [ones])
+    found = Estimates(arm, arm, None, poses)
+    counted = _clues(found, found, poses, bridged)[0, :, 0]
     assert counted.tolist() == [float(not 10 <= t <= 12) for t in range(30)]

@@ -1,9 +1,10 @@
-"""Windows and arms of bones averaged by their evidence."""
+"""Windows and arms of bones averaged by clues which of them knows the person."""
 
 import copy
 import functools
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,12 +12,15 @@ from tests.upper_body.test_articulated import CAMERA, ROW, body, pixels
 from torchpose import PinholeCamera
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
+from torchpose.filters._outputs import FilterOutput
 from torchpose.math import euler_to_matrix
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
-from torchpose.upper_body import UpperBodyTracker
+from torchpose.upper_body import UpperBodyTracker, _multiple_models
+from torchpose.upper_body._estimator import Estimates, SeenPoses
 from torchpose.upper_body._fusion import ReadOut, in_body_axes, in_camera_axes, put_at
-from torchpose.upper_body._multiple_models import _averaged
+from torchpose.upper_body._measured_joints import MeasuredJoints
+from torchpose.upper_body._multiple_models import _averaged, _clues, _log_odds
 
 BOTH = ("window-mixture", "articulated")
 FEW = ("head", "neck", "hand_left", "hand_right")
@@ -127,23 +131,62 @@ def test_sequences_of_a_batch_do_not_know_of_each_other(prior):
     torch.testing.assert_close(both.joints3d[:1, :20], alone.joints3d, atol=1e-8, rtol=1e-6)
 
 
-def test_smoothed_odds_rest_on_what_was_predicted_before_and_after(smoothed_shares):
-    """Not on windows with later frames in them, which predict any person well."""
-    filtered, smoothed = (smoothed_shares(smoothing)[0] for smoothing in (None, "full"))
+USUAL = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2], dtype=torch.float64)
 
-    def discounted(values):
-        sums = [values[0]]
-        for value in values[1:]:
-            sums.append(math.exp(-1 / 120) * sums[-1] + value)
-        return torch.stack(sums)
 
-    counts = torch.ones_like(filtered)
-    sums = (filtered.logit() - 0.5) / 0.5 * discounted(counts)
-    ratios = sums.clone()
-    ratios[1:] -= math.exp(-1 / 120) * sums[:-1]
-    both = [discounted(x) + discounted(x.flip(0)).flip(0) - x for x in (ratios, counts)]
-    expected = torch.sigmoid(0.5 + 0.5 * both[0] / both[1])
-    torch.testing.assert_close(smoothed, expected, atol=1e-6, rtol=0)
+def test_smoothed_odds_rest_on_clues_before_and_after(prior, monkeypatch):
+    """Their evidence is not that of windows with later frames in them, which predict any person well."""
+    found = []
+
+    def spied(*args):
+        found.append(_clues(*args))
+        return found[-1]
+
+    monkeypatch.setattr(_multiple_models, "_clues", spied)
+    smoothed, _ = shares(prior, of_stranger(30), smoothing="full", steady=False)
+    filtered, _ = shares(prior, of_stranger(30), steady=False)
+    later, earlier = (x[0] for x in found)
+    torch.testing.assert_close(later[:, :2], earlier[:, :2])
+    ahead = torch.arange(30)[:, None] - torch.arange(30)
+    weights = torch.exp(-ahead.abs().double() / 120)
+    begun = torch.exp(-torch.arange(1, 31).double() / 120)[:, None] * 7.5 * USUAL
+    for share, sums in ((filtered, weights.tril() @ earlier), (smoothed, weights @ later)):
+        expected = torch.sigmoid(_log_odds(begun + sums))
+        torch.testing.assert_close(share, expected, atol=1e-6, rtol=0)
+
+
+def test_log_odds_are_those_of_the_equation():
+    generator = torch.Generator().manual_seed(0)
+    d, y, *x = 0.2 * torch.randn(4, 50, generator=generator, dtype=torch.float64) - 0.1
+    weights = torch.exp(-torch.arange(50).flip(0) / 120).double()
+    clues = torch.stack([torch.ones(50).double(), d, y, *x, *(part**2 for part in x)], -1)
+    mean_d, mean_y = (np.average(part, weights=weights) for part in (d, y))
+    varied = np.mean([np.cov(part, aweights=weights, ddof=0) for part in x])
+    assert mean_y < 0
+    expected = 1.0 + 0.5 * mean_d - math.log1p(varied / 0.1**2) + 15 * mean_y
+    assert float(_log_odds(weights @ clues)) == pytest.approx(expected)
+
+
+def clues_of(ours, theirs):
+    """Return the clues of poses whose keypoints are as likely by both models."""
+    n = ours.shape[1]
+    arm = FilterOutput(*3 * [torch.ones(1, n, dtype=torch.float64)], None, torch.full((1,), -1))
+    seen = MeasuredJoints(
+        torch.zeros(1, n, 8, 2), torch.ones(1, n, 8, dtype=torch.bool), torch.eye(2)
+    )
+    windows, bones = (SeenPoses(joints, *6 * [joints]) for joints in (ours, theirs))
+    return _clues(Estimates(arm, arm), Estimates(arm, arm, None, bones), windows, seen)
+
+
+def test_arms_that_change_their_length_and_small_bodies_tell_against_windows():
+    pose = torch.rand(1, 1, 8, 3, dtype=torch.float64) + 2.0
+    same = pose.expand(1, 20, 8, 3)
+    neck = same[:, :, ROW["neck"], None]
+    changing = neck + (same - neck) * (1.0 + 0.3 * (torch.arange(20) % 2))[:, None, None]
+    cases = (same, changing, 0.9 * same, 1.1 * same)
+    odds = [float(_log_odds(clues_of(ours, same).sum(1))) for ours in cases]
+    assert odds[1] < odds[0] - 0.5 and odds[2] == pytest.approx(odds[0] + 15 * math.log(0.9))
+    assert odds[3] == pytest.approx(odds[0])
 
 
 @pytest.mark.slow
@@ -158,12 +201,29 @@ def test_a_lag_that_reaches_the_end_is_full_smoothing(prior, of_performer):
     torch.testing.assert_close(*last, rtol=0, atol=0.02)
 
 
-def test_frames_without_arms_leave_the_odds(prior):
+@pytest.mark.parametrize("smoothing", [None, 20])
+def test_frames_without_arms_leave_the_odds_and_how_far_both_models_are_apart(prior, smoothing):
     keypoints = of_stranger(30)
     keypoints[:, 10:, 2:] = torch.nan
-    share, off = shares(prior, keypoints)
-    assert float(off) < 1e-9
-    torch.testing.assert_close(share[10:], share[9].expand(20), atol=1e-8, rtol=1e-6)
+    mixed, bones = (
+        tracked(prior, keypoints, method, smoothing=smoothing, steady=False).joints3d[0]
+        for method in ("multiple-model", "articulated")
+    )
+    apart = (mixed - bones)[:, INFERRED]
+    torch.testing.assert_close(apart[10:], apart[9].expand(20, 4, 3), atol=1e-6, rtol=1e-6)
+    assert float(apart[9].abs().max()) > 0.01
+
+
+def test_a_stream_holds_windows_as_the_whole_recording_does(prior):
+    keypoints = of_stranger(16)
+    keypoints[:, [0, 1, 5, 6, 12], 2:] = torch.nan
+    tracker = UpperBodyTracker(prior, CAMERA, "multiple-model", fps=30.0)
+    whole = tracker(keypoints, names=list(FEW))
+    state, parts = tracker.init(1, names=list(FEW)), []
+    for part in keypoints.split(6, 1):
+        state, track = tracker.advance(state, part)
+        parts.append(track.joints3d)
+    torch.testing.assert_close(torch.cat(parts, 1), whole.joints3d, atol=1e-8, rtol=1e-6)
 
 
 def poses(seed, angles=None):

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.filters._outputs import first_not_finite
 from torchpose.priors._arms import ArmPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
-from torchpose.upper_body._articulated_frame import ELBOWS, HANDS
+from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,
@@ -37,10 +38,15 @@ from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
-_MEMORY = 4.0  # seconds after which evidence counts for 1/e
+_NECK = UPPER_BODY.index("neck")
+_MEMORY = 4.0  # seconds after which a clue counts for 1/e
+_FIRST = 1.0  # log-odds of windows without any clue
 # Share of the mean evidence that counts: frames are alike, so many tell no more than few.
 _EVIDENCE_SHARE = 0.5
-_FIRST = 0.5  # log-odds of windows before the first frame
+_LENGTH_SPREAD = 0.1  # of the log of arms' lengths; by windows, more than this tells against them
+_NEARNESS_WEIGHT = 15.0  # for each e-fold by which windows put a body nearer than bones do
+_USUAL_TIME = 0.25  # seconds of usual frames that clues begin with
+_USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
 # between the two. As four sets have it that were in no fit.
 _BETWEEN = 0.5
@@ -51,25 +57,37 @@ class MultipleModelState(NamedTuple):
 
     Attributes:
         windows, articulated: the states of both models. motion: the state of the motion stage of windows.
-        ratios: the discounted sums of the log-likelihood ratios of windows and of their weights, [B, 2].
+        clues: the discounted sums of what tells which model knows the person (`_clues`), [B, 7].
+        apart: how far windows were from bones when an arm was last measured (`_packed`), [B, 43].
     """
 
     windows: WindowState
     articulated: ArticulatedState
     motion: MotionStageState | None
-    ratios: Tensor
+    clues: Tensor
+    apart: Tensor
 
 
 class MultipleModelFilter(Estimator):
-    """Estimator that averages "window-mixture" and "articulated" by their evidence.
+    """Estimator that averages "window-mixture" and "articulated" by clues which of them knows the person.
 
     Windows know the persons and the motions of their prior well and others badly; arms of bones are the
-    other way round. Both say how likely elbow and hand of each arm are, given the torso. The log-odds l
-    of windows are these, averaged over the last seconds, since frames of one motion err alike (dynamic
-    model averaging, Raftery et al. 2010, with a tempered likelihood):
+    other way round. Both say how likely elbow and hand of each arm are, given the torso (d_s). Hands alone
+    tell little, so two more clues count: lengths of arms that change from frame to frame (x_s), and bodies
+    that are nearer, so smaller, than bones have them (y_s). All are averaged over the last seconds, since
+    frames of one motion err alike (dynamic model averaging, Raftery et al. 2010, with a tempered
+    likelihood). The log-odds l of windows are
 
         d_s = sum_arms log p_windows(z_s | ...) - log p_articulated(z_s | ...)
-        l_t = l_0 + c sum_s a^(t-s) d_s / sum_s a^(t-s),   a = e^(-1 / (4 s f)),   c = 1/2
+        x_s = log(length of the arm by windows / by bones)
+        y_s = log(depth of the neck by windows / by bones)
+        l_t = 1 + 0.5 E[d] - log(1 + Var[x] / 0.1^2) - 15 max(0, -E[y])
+
+    with means E and variances Var, over both arms, of weights a^(t-s), a = e^(-1 / (4 s f)). They begin as
+    if a quarter of a second with d = y = 0 and Var[x] = 0.06^2 had preceded.
+
+    Where no arm is measured windows know less than where the arms were. There they are as far from bones
+    as when an arm was last measured.
 
     Joints are averaged in camera axes with weights sigma(l_t) and 1 - sigma(l_t), and covariances
     include how far the two are apart. So lengths of bones change where both have weight; `bone_lengths` are
@@ -98,6 +116,7 @@ class MultipleModelFilter(Estimator):
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix_like(model.measurement_cov)
         self.order = model.prior.info.rotation_order
+        self._usual = _USUAL_TIME * model.rate * self.matrix.new_tensor(_USUAL)
 
     def init(
         self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
@@ -107,7 +126,8 @@ class MultipleModelFilter(Estimator):
             self.windows.init(batch_size, joints, arm_generators),
             self.articulated.init(batch_size, joints, arm_generators),
             None,
-            self.matrix.new_zeros(batch_size, 2),
+            self._usual.expand(batch_size, -1),
+            self.matrix.new_zeros(batch_size, 43),
         )
 
     def advance(
@@ -119,10 +139,11 @@ class MultipleModelFilter(Estimator):
         reading, motion = read_out(seen, self.matrix, self.order), state.motion
         if self._stage is not None:
             motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
-        sums = self._sums(state.ratios, _log_ratios(seen, bodies, measured))
         poses = in_camera_axes(reading, self.order)
+        poses, apart = _held(poses, bodies, measured, state.apart)
+        sums = self._sums(state.clues, _clues(seen, bodies, poses, measured))
         mixed = self._mixed(sums, poses, seen, bodies, measured)
-        return MultipleModelState(windows, articulated, motion, sums[:, -1]), mixed
+        return MultipleModelState(windows, articulated, motion, sums[:, -1], apart), mixed
 
     def forward(
         self,
@@ -148,18 +169,18 @@ class MultipleModelFilter(Estimator):
             told = self.causal.forward(measured, joints, arm_generators, lengths)
             half = torch.full_like(poses.place[..., 0], 0.5)
             poses = _averaged(half, poses, self._steadied(told, lengths))
+        poses, _ = _held(poses, bodies, measured, self.matrix.new_zeros(len(poses.joints), 43))
         predicted = bodies
         if self.articulated.ahead:
             predicted = self.articulated.filtered(
                 measured, joints, arm_generators, lengths, progress
             )
-        ratios = _log_ratios(told, predicted, measured)
+        clues = _clues(told, predicted, poses, measured)
         if lengths is not None:
-            frames = torch.arange(ratios.shape[1], device=ratios.device)
-            ratios = ratios * (frames < lengths.to(ratios.device)[:, None])[..., None]
-        none = ratios.new_zeros(len(ratios), 2)
-        sums = self._sums(none, ratios)
-        sums = sums + self._later_sums(ratios) - ratios
+            frames = torch.arange(clues.shape[1], device=clues.device)
+            clues = clues * (frames < lengths.to(clues.device)[:, None])[..., None]
+        sums = self._sums(self._usual.expand(len(clues), -1), clues)
+        sums = sums + self._later_sums(clues) - clues
         return repeat_last(self._mixed(sums, poses, seen, bodies, measured), lengths)
 
     def _steadied(self, seen: Estimates, lengths: Tensor | None) -> SeenPoses:
@@ -178,20 +199,20 @@ class MultipleModelFilter(Estimator):
         return kept_stage(model.owner, ratios, model.rate, model.measurement_cov)
 
     def _sums(
-        self, before: Float[Tensor, "B 2"], ratios: Float[Tensor, "B T 2"]
-    ) -> Float[Tensor, "B T 2"]:
-        """Return the discounted sums of the log-likelihood ratios and of their weights after each frame."""
+        self, before: Float[Tensor, "B K"], clues: Float[Tensor, "B T K"]
+    ) -> Float[Tensor, "B T K"]:
+        """Return the discounted sums of clues after each frame."""
         sums = []
-        for now in ratios.unbind(1):
+        for now in clues.unbind(1):
             before = self.forget * before + now
             sums.append(before)
         return torch.stack(sums, 1)
 
-    def _later_sums(self, ratios: Float[Tensor, "B T 2"]) -> Float[Tensor, "B T 2"]:
+    def _later_sums(self, clues: Float[Tensor, "B T K"]) -> Float[Tensor, "B T K"]:
         """Return the discounted sums of each frame and of the later ones that smoothing uses."""
-        later = self._sums(torch.zeros_like(ratios[:, 0]), ratios.flip(1)).flip(1)
+        later = self._sums(torch.zeros_like(clues[:, 0]), clues.flip(1)).flip(1)
         lag = self.model.smoothing
-        if not isinstance(lag, int) or lag + 1 >= ratios.shape[1]:
+        if not isinstance(lag, int) or lag + 1 >= clues.shape[1]:
             return later
         beyond = torch.zeros_like(later)
         beyond[:, : -lag - 1] = self.forget ** (lag + 1) * later[:, lag + 1 :]
@@ -199,7 +220,7 @@ class MultipleModelFilter(Estimator):
 
     def _mixed(
         self,
-        sums: Float[Tensor, "B T 2"],
+        sums: Float[Tensor, "B T K"],
         poses: SeenPoses,
         seen: Estimates,
         bodies: Estimates,
@@ -208,19 +229,16 @@ class MultipleModelFilter(Estimator):
         """Return the mixture of both models, with its log-evidence.
 
         Args:
-            sums: the discounted sums of the log-likelihood ratios and of their weights.
+            sums: the discounted sums of clues.
             poses: those of windows, after their motion stage.
             seen, bodies: the estimates of windows and of bones. measured: the measurements.
         """
-        if bodies.poses is None:
-            raise RuntimeError("an articulated filter reads its poses itself")
         poses = on_their_rays(poses, self.matrix, measured.mask)
         if self.model.calibrated:
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             poses = poses._replace(covs=recalibrated(poses.covs, noise, mode))
-        mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
-        share = torch.sigmoid(_FIRST + _EVIDENCE_SHARE * mean_ratio)
-        mixed = _averaged(share, poses, bodies.poses)
+        share = torch.sigmoid(_log_odds(sums))
+        mixed = _averaged(share, poses, _poses_of(bodies))
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
             mixed = mixed._replace(covs=trust[..., None, None, None] * mixed.covs)
@@ -245,15 +263,76 @@ def _windows_of_limbs(model: TrackerModel) -> WindowMixture:
     return windows
 
 
-def _log_ratios(
-    windows: Estimates, bodies: Estimates, measured: MeasuredJoints
-) -> Float[Tensor, "B T 2"]:
-    """Return the log-likelihood ratio of windows to bones for both arms, and 1 where a limb is measured."""
+def _held(
+    poses: SeenPoses, bodies: Estimates, measured: MeasuredJoints, before: Float[Tensor, "B 43"]
+) -> tuple[SeenPoses, Float[Tensor, "B 43"]]:
+    """Return the poses of windows, as far from those of bones as they were last where no arm is measured.
+
+    Args:
+        poses: those of windows. bodies: the estimates of bones. measured: what both measured, or what was
+            put into gaps. before: how far apart both were before the first frame.
+
+    Returns:
+        The poses, and how far apart both are after the last frame.
+    """
+    told, theirs = _some_arm(measured.mask), _packed(_poses_of(bodies))
+    ours = _packed(poses)
+    apart = torch.cat([before[:, None], ours - theirs], 1)
+    frames = torch.arange(1, apart.shape[1], device=told.device)
+    last = frames.where(told, 0).cummax(1).values
+    apart = apart.gather(1, last[..., None].expand(-1, -1, apart.shape[2]))
+    joints, uv, place = torch.where(told[..., None], ours, theirs + apart).split([24, 16, 3], -1)
+    held = poses._replace(
+        joints=joints.unflatten(-1, (8, 3)), uv=uv.unflatten(-1, (8, 2)), place=place
+    )
+    return held, apart[:, -1]
+
+
+def _packed(poses: SeenPoses) -> Float[Tensor, "B T 43"]:
+    """Return joints, pixels and places of poses in one tensor."""
+    return torch.cat([poses.joints.flatten(2), poses.uv.flatten(2), poses.place], -1)
+
+
+def _poses_of(bodies: Estimates) -> SeenPoses:
+    """Return the poses that the filter of bones reads out itself."""
+    if bodies.poses is None:
+        raise RuntimeError("an articulated filter reads its poses itself")
+    return bodies.poses
+
+
+def _some_arm(mask: Bool[Tensor, "B T 8"]) -> Bool[Tensor, "B T"]:
+    """Return where the elbow or the hand of an arm is measured."""
+    return (mask[..., ELBOWS] | mask[..., HANDS]).any(-1)
+
+
+def _clues(
+    windows: Estimates, bodies: Estimates, poses: SeenPoses, measured: MeasuredJoints
+) -> Float[Tensor, "B T 7"]:
+    """Return the clues of each frame: 1 and d, y, x and x^2 of both arms; zero where no limb is measured.
+
+    Args:
+        windows, bodies: the estimates of windows and of bones. poses: those of windows. measured: what
+            both measured.
+    """
     ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (windows, bodies))
-    seen = measured.seen
-    some = (seen[..., ELBOWS] | seen[..., HANDS]).any(-1)
-    apart = torch.where(some, (ours - theirs).nan_to_num(0.0), 0.0)
-    return torch.stack([apart, some.to(apart)], -1)
+    both = torch.stack([poses.joints, _poses_of(bodies).joints])
+    shoulders, elbows, hands = (both[..., rows, :] for rows in (SHOULDERS, ELBOWS, HANDS))
+    lengths = (elbows - shoulders).norm(dim=-1) + (hands - elbows).norm(dim=-1)
+    logs = torch.cat([both[..., _NECK, 2:], lengths], -1).log()
+    apart = logs[0] - logs[1]
+    ratio = (ours - theirs)[..., None]
+    clues = torch.cat([torch.ones_like(ratio), ratio, apart, apart[..., 1:].square()], -1)
+    return torch.where(_some_arm(measured.seen)[..., None], clues.nan_to_num(0.0), 0.0)
+
+
+def _log_odds(sums: Float[Tensor, "*frames 7"]) -> Float[Tensor, " *frames"]:
+    """Return the log-odds of windows, by discounted sums of clues (`_clues`)."""
+    means = sums / sums[..., :1]
+    _, ratio, nearness, *_ = means.unbind(-1)
+    varied = (means[..., 5:] - means[..., 3:5].square()).clamp_min(0.0).mean(-1)
+    unsteady = torch.log1p(varied / _LENGTH_SPREAD**2)
+    nearer = _NEARNESS_WEIGHT * (-nearness).clamp_min(0.0)
+    return _FIRST + _EVIDENCE_SHARE * ratio - unsteady - nearer
 
 
 def _averaged(share: Float[Tensor, "B T"], ours: SeenPoses, theirs: SeenPoses) -> SeenPoses:

@@ -94,8 +94,8 @@ class UpperBodyTracker(WideModule):
       beside the views that the prior was fitted to.
     - ``articulated``: arms of bones that keep their lengths, under a prior over directions that
       depends on no camera and no size; for all joints measured, of anybody.
-    - ``multiple-model``: both of these, averaged by what they predicted of elbows and hands; for strangers of
-      whom few joints are measured.
+    - ``multiple-model``: both of these, averaged by clues which of them knows the person; for anybody of whom
+      few joints are measured.
     - ``mkf-fixed``, ``mkf-sampled``, ``mkf-split``: banks of Kalman filters over single poses (BL
       section 3.4), see `MixtureKalmanFilter`.
     - ``pf-mixture``, ``pf-walk``, ``pf-walk-unscaled``: particles over single poses (BL section 3.3),
