@@ -155,16 +155,17 @@ def test_smoothed_odds_rest_on_clues_before_and_after(prior, monkeypatch):
         torch.testing.assert_close(share, expected, atol=1e-6, rtol=0)
 
 
-def test_log_odds_are_those_of_the_equation():
+@pytest.mark.parametrize(("depth", "nearer"), [(0.1, 0.0), (-0.04, 0.6), (-0.2, 0.8)])
+def test_log_odds_are_those_of_the_equation(depth, nearer):
     generator = torch.Generator().manual_seed(0)
-    d, y, *x = 0.2 * torch.randn(4, 50, generator=generator, dtype=torch.float64) - 0.1
+    d, *x = 0.2 * torch.randn(3, 50, generator=generator, dtype=torch.float64) - 0.1
+    y = torch.full_like(d, depth)
     weights = torch.exp(-torch.arange(50).flip(0) / 120).double()
     clues = torch.stack([torch.ones(50).double(), d, y, *x, *(part**2 for part in x)], -1)
-    mean_d, mean_y = (np.average(part, weights=weights) for part in (d, y))
+    mean_d = np.average(d, weights=weights)
     varied = np.mean([np.cov(part, aweights=weights, ddof=0) for part in x])
-    assert mean_y < 0
-    expected = 1.0 + 0.5 * mean_d - math.log1p(varied / 0.1**2) + 15 * mean_y
-    assert float(_log_odds(weights @ clues)) == pytest.approx(expected)
+    expected = 1.0 + 0.5 * mean_d - math.log1p(varied / 0.1**2)
+    assert float(_log_odds(weights @ clues)) == pytest.approx(expected - nearer)
 
 
 def clues_of(ours, theirs):
@@ -185,7 +186,7 @@ def test_arms_that_change_their_length_and_small_bodies_tell_against_windows():
     changing = neck + (same - neck) * (1.0 + 0.3 * (torch.arange(20) % 2))[:, None, None]
     cases = (same, changing, 0.9 * same, 1.1 * same)
     odds = [float(_log_odds(clues_of(ours, same).sum(1))) for ours in cases]
-    assert odds[1] < odds[0] - 0.5 and odds[2] == pytest.approx(odds[0] + 15 * math.log(0.9))
+    assert odds[1] < odds[0] - 0.5 and odds[2] == pytest.approx(odds[0] - 0.8)
     assert odds[3] == pytest.approx(odds[0])
 
 
@@ -212,6 +213,13 @@ def test_frames_without_arms_leave_the_odds_and_how_far_both_models_are_apart(pr
     apart = (mixed - bones)[:, INFERRED]
     torch.testing.assert_close(apart[10:], apart[9].expand(20, 4, 3), atol=1e-6, rtol=1e-6)
     assert float(apart[9].abs().max()) > 0.01
+
+
+def test_before_an_arm_is_measured_windows_are_themselves(prior):
+    keypoints = of_stranger(12)
+    keypoints[:, :8, 2:] = torch.nan
+    share, off = shares(prior, keypoints)
+    assert float(off) < 1e-9 and bool(((share > 0.1) & (share < 1)).all())
 
 
 def test_a_stream_holds_windows_as_the_whole_recording_does(prior):

@@ -44,7 +44,8 @@ _FIRST = 1.0  # log-odds of windows without any clue
 # Share of the mean evidence that counts: frames are alike, so many tell no more than few.
 _EVIDENCE_SHARE = 0.5
 _LENGTH_SPREAD = 0.1  # of the log of arms' lengths; by windows, more than this tells against them
-_NEARNESS_WEIGHT = 15.0  # for each e-fold by which windows put a body nearer than bones do
+# For each e-fold by which windows put a body nearer than bones do, and at most.
+_NEARNESS_WEIGHT, _MOST_NEARNESS = 15.0, 0.8
 _USUAL_TIME = 0.25  # seconds of usual frames that clues begin with
 _USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
@@ -81,7 +82,7 @@ class MultipleModelFilter(Estimator):
         d_s = sum_arms log p_windows(z_s | ...) - log p_articulated(z_s | ...)
         x_s = log(length of the arm by windows / by bones)
         y_s = log(depth of the neck by windows / by bones)
-        l_t = 1 + 0.5 E[d] - log(1 + Var[x] / 0.1^2) - 15 max(0, -E[y])
+        l_t = 1 + 0.5 E[d] - log(1 + Var[x] / 0.1^2) - min(0.8, 15 max(0, -E[y]))
 
     with means E and variances Var, over both arms, of weights a^(t-s), a = e^(-1 / (4 s f)). They begin as
     if a quarter of a second with d = y = 0 and Var[x] = 0.06^2 had preceded.
@@ -127,7 +128,7 @@ class MultipleModelFilter(Estimator):
             self.articulated.init(batch_size, joints, arm_generators),
             None,
             self._usual.expand(batch_size, -1),
-            self.matrix.new_zeros(batch_size, 43),
+            self._unknown(batch_size),
         )
 
     def advance(
@@ -169,7 +170,7 @@ class MultipleModelFilter(Estimator):
             told = self.causal.forward(measured, joints, arm_generators, lengths)
             half = torch.full_like(poses.place[..., 0], 0.5)
             poses = _averaged(half, poses, self._steadied(told, lengths))
-        poses, _ = _held(poses, bodies, measured, self.matrix.new_zeros(len(poses.joints), 43))
+        poses, _ = _held(poses, bodies, measured, self._unknown(len(poses.joints)))
         predicted = bodies
         if self.articulated.ahead:
             predicted = self.articulated.filtered(
@@ -182,6 +183,10 @@ class MultipleModelFilter(Estimator):
         sums = self._sums(self._usual.expand(len(clues), -1), clues)
         sums = sums + self._later_sums(clues) - clues
         return repeat_last(self._mixed(sums, poses, seen, bodies, measured), lengths)
+
+    def _unknown(self, batch_size: int) -> Float[Tensor, "B 43"]:
+        """Return how far both models are apart before an arm was measured."""
+        return self.matrix.new_full((batch_size, 43), math.nan)
 
     def _steadied(self, seen: Estimates, lengths: Tensor | None) -> SeenPoses:
         """Return the poses of windows over whole sequences, after their motion stage."""
@@ -270,7 +275,7 @@ def _held(
 
     Args:
         poses: those of windows. bodies: the estimates of bones. measured: what both measured, or what was
-            put into gaps. before: how far apart both were before the first frame.
+            put into gaps. before: how far apart both were when an arm was last measured, else NaN.
 
     Returns:
         The poses, and how far apart both are after the last frame.
@@ -281,7 +286,8 @@ def _held(
     frames = torch.arange(1, apart.shape[1], device=told.device)
     last = frames.where(told, 0).cummax(1).values
     apart = apart.gather(1, last[..., None].expand(-1, -1, apart.shape[2]))
-    joints, uv, place = torch.where(told[..., None], ours, theirs + apart).split([24, 16, 3], -1)
+    packed = torch.where(told[..., None] | apart.isnan(), ours, theirs + apart)
+    joints, uv, place = packed.split([24, 16, 3], -1)
     held = poses._replace(
         joints=joints.unflatten(-1, (8, 3)), uv=uv.unflatten(-1, (8, 2)), place=place
     )
@@ -331,7 +337,7 @@ def _log_odds(sums: Float[Tensor, "*frames 7"]) -> Float[Tensor, " *frames"]:
     _, ratio, nearness, *_ = means.unbind(-1)
     varied = (means[..., 5:] - means[..., 3:5].square()).clamp_min(0.0).mean(-1)
     unsteady = torch.log1p(varied / _LENGTH_SPREAD**2)
-    nearer = _NEARNESS_WEIGHT * (-nearness).clamp_min(0.0)
+    nearer = (-_NEARNESS_WEIGHT * nearness).clamp(0.0, _MOST_NEARNESS)
     return _FIRST + _EVIDENCE_SHARE * ratio - unsteady - nearer
 
 
