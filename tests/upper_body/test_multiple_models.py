@@ -190,6 +190,10 @@ def test_arms_that_change_their_length_and_small_bodies_tell_against_windows():
     assert odds[3] == pytest.approx(odds[0])
 
 
+def test_what_was_told_an_hour_ago_tells_nothing():
+    assert float(_log_odds(math.exp(-900) * 7.5 * USUAL)) == 1.0
+
+
 @pytest.mark.slow
 def test_a_lag_that_reaches_the_end_is_full_smoothing(prior, of_performer):
     few = of_performer[:, :26]

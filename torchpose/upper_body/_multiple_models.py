@@ -333,7 +333,7 @@ def _clues(
 
 def _log_odds(sums: Float[Tensor, "*frames 7"]) -> Float[Tensor, " *frames"]:
     """Return the log-odds of windows, by discounted sums of clues (`_clues`)."""
-    means = sums / sums[..., :1]
+    means = sums / sums[..., :1].clamp_min(1e-12)  # minutes without an arm are as no frame at all
     _, ratio, nearness, *_ = means.unbind(-1)
     varied = (means[..., 5:] - means[..., 3:5].square()).clamp_min(0.0).mean(-1)
     unsteady = torch.log1p(varied / _LENGTH_SPREAD**2)
