@@ -1,7 +1,5 @@
 """The network that tells hands in a window, and hands that are gone."""
 
-from copy import deepcopy
-
 import pytest
 import torch
 
@@ -254,7 +252,7 @@ def test_a_measurer_computes_the_elbows_that_it_returns(monkeypatch, elbows):
 
 @torch.no_grad()
 def test_what_is_kept_for_inference_follows_the_parameters():
-    network = deepcopy(shipped_hand_network())
+    network = shipped_hand_network()
     before = network.find(*windows())
     network.places.weight.mul_(2)
     network.low[0][1].running_var.mul_(0.5)
@@ -264,9 +262,31 @@ def test_what_is_kept_for_inference_follows_the_parameters():
 
 
 def test_what_learns_is_not_folded():
-    network = deepcopy(shipped_hand_network()).requires_grad_(True)
+    network = shipped_hand_network().requires_grad_(True)
     network.find(*windows()).log_prob.sum().backward()
     assert network.colours[0][0].weight.grad is not None
+
+
+@pytest.mark.parametrize("change", ["train", "half", "double"])
+def test_models_that_hold_a_measurer_leave_its_network_as_it_is(change):
+    prior = torchpose.load_prior("kinect-upper-body-small")
+    measurer, other = (UpperBodyMeasurer(prior).hand_tracker for _ in range(2))
+    frames = [scene(t) for t in range(3)]
+    _, expected = follow(other, frames, PERSON)
+    getattr(torch.nn.Sequential(measurer), change)()
+    for tracker in (measurer, other):
+        _, out = follow(tracker, frames, PERSON)
+        torch.testing.assert_close(out, expected, rtol=0, atol=0, equal_nan=True)
+
+
+def test_measurers_share_no_tensors():
+    prior = torchpose.load_prior("kinect-upper-body-small")
+    measurers = [UpperBodyMeasurer(prior) for _ in range(2)]
+    one, other = (
+        {x.data_ptr() for x in measurer.state_dict().values() if x.numel()}
+        for measurer in measurers
+    )
+    assert one.isdisjoint(other)
 
 
 def test_without_a_network_no_hand_is_gone():

@@ -1,5 +1,7 @@
 """Tables of where hands are, against samples of the prior."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -70,9 +72,16 @@ def test_mirrored_arms_have_mirrored_tables(prior):
     torch.testing.assert_close(mirrored, flipped, atol=1e-3, rtol=1e-3)
 
 
-def test_tables_are_kept_and_looked_up_between_places(prior):
+def test_tables_follow_changes_of_the_prior(prior):
+    changed = copy.deepcopy(prior)
+    before = HandPrior.from_prior(changed)
+    changed.left.means[:, :2] += 20.0
+    after = HandPrior.from_prior(changed).table
+    assert not torch.equal(after[0], before.table[0]) and torch.equal(after[1], before.table[1])
+
+
+def test_tables_are_looked_up_between_places(prior):
     table = HandPrior.from_prior(prior)
-    assert HandPrior.from_prior(prior) is table
     log_density, elbow = table(torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0], [99.0, 0.0]]))
     torch.testing.assert_close(log_density[:, 1], log_density[:, [0, 2]].mean(1))
     assert torch.equal(log_density[:, 0], table.table[:, 0, 25, 50])

@@ -265,6 +265,13 @@ class OwnPrecisionModule(_LoadsInOwnPrecision):
         return super()._apply(moved, recurse)
 
 
+class CpuModule(nn.Module):
+    """Stays on the CPU in its own precision, whatever `.to()` asks for: images are measured by OpenCV."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        return self
+
+
 class WideModule(OwnPrecisionModule):
     """Keeps the precision of its tensors, and has one for what goes in and comes out.
 

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
+from torchpose._core.module_state import CpuModule
 from torchpose.errors import InputError
 from torchpose.measure._edges import ARM_LIMBS, Segments, limb_votes, segments_of_arms
 from torchpose.measure._persons import match_states
@@ -30,7 +31,7 @@ class AssociationState(NamedTuple):
     identity: Int[Tensor, " N"]
 
 
-class HandAssociation(nn.Module):
+class HandAssociation(CpuModule):
     """Decides from the edges of the arms whether left and right hand are swapped.
 
     For the hands as measured (h = 0) and swapped (h = 1) a pose tracker has inferred elbows and

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -306,7 +307,12 @@ def _coarse_centres() -> Float[Tensor, "r c 2"]:
     return avg_pool2d(cell_centres().movedim(-1, 0), 2).movedim(0, -1).contiguous()
 
 
-@cache
+@outside_inference()
 def shipped_hand_network() -> HandNetwork:
-    """Return the network that comes with the package; read once."""
+    """Return the network that comes with the package, a copy of its own for each caller."""
+    return deepcopy(_read_once())
+
+
+@cache
+def _read_once() -> HandNetwork:
     return HandNetwork.load(_SHIPPED)

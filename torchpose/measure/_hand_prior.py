@@ -1,13 +1,13 @@
 """Tabulate where hands and elbows are relative to the face (after Burke & Lasenby, section 3)."""
 
 import math
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_shape
+from torchpose._core.module_state import derived, register_given
 from torchpose.errors import InputError
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -18,8 +18,6 @@ _HAND, _ELBOW, _HEAD, _DEPTH = slice(0, 2), slice(3, 5), slice(9, 11), 11
 _NEAREST = 0.3  # metres: a depth below it is a tail of a Gaussian, not a person
 _SMOOTH, _ANYWHERE, _VAGUE = 0.2, 0.05, 1e-4
 _NODES, _CHUNK = 5, 4096
-
-_made: WeakKeyDictionary[UpperBodyPrior, "HandPrior"] = WeakKeyDictionary()
 
 
 class HandPrior(nn.Module):
@@ -48,13 +46,13 @@ class HandPrior(nn.Module):
     def __init__(self, table: Float[Tensor, "2 3 91 101"]) -> None:
         super().__init__()
         check_shape("table", table, [2, 3, *_SIZE])
-        self.register_buffer("table", table)
+        register_given(self, "table", table)
 
     table: Tensor
 
     @classmethod
     def from_prior(cls, prior: UpperBodyPrior) -> "HandPrior":
-        """Return the tables of a prior over poses, for any camera; cached.
+        """Return the tables of a prior over poses, for any camera; computed once for each.
 
         The depth of the head is summed over five nodes of Gauss-Hermite quadrature; given it, the
         offsets are Gaussian for every component, so nothing is sampled.
@@ -62,11 +60,15 @@ class HandPrior(nn.Module):
         Raises:
             InputError: a prior whose heads are all behind or too near the camera.
         """
-        if prior not in _made:
-            focal = (prior.info.fx, prior.info.fy)
-            arms = [_arm_table(arm, focal) for arm in (prior.left, prior.right)]
-            _made[prior] = cls(torch.stack(arms).float())
-        return _made[prior]
+        focal = (prior.info.fx, prior.info.fy)
+        arms = (prior.left, prior.right)
+        sources = tuple(x for arm in arms for x in arm.parameters_tuple())
+        with torch.no_grad():
+            table = derived(
+                prior, ("hands", focal), sources,
+                lambda: torch.stack([_arm_table(arm, focal) for arm in arms]).float(),
+            )  # fmt: skip
+        return cls(table)
 
     def forward(
         self, offsets: Float[Tensor, "*batch 2"]

@@ -2,15 +2,15 @@
 
 import math
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import interpolate
 
 from torchpose._core.images import Image
-from torchpose._core.module_state import outside_inference
+from torchpose._core.module_state import CpuModule, outside_inference
 from torchpose.errors import InputError
 from torchpose.measure._background import Motion
 from torchpose.measure._body_window import (
@@ -77,7 +77,7 @@ class HandState(NamedTuple):
     beliefs: HandBeliefs
 
 
-class HandTracker(nn.Module):
+class HandTracker(CpuModule):
     """Tracks both hands of every person by a histogram filter in a window about the face.
 
     The likelihood of a hand comes from skin (against clothes and background), motion and the shape
@@ -147,6 +147,13 @@ class HandTracker(nn.Module):
             unknown=s.unknown_skin,
         )  # fmt: skip
         self.windows = HandWindows(s, rate, prior, self.skin, self.motion, self.likelihood, network)
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode, as a model in training does; the network learns nothing here, and stays as it is."""
+        super().train(mode)
+        if self.network is not None:
+            self.network.eval()
+        return self
 
     def init(self) -> HandState:
         """Return the state without persons."""

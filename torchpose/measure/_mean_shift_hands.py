@@ -8,9 +8,10 @@ from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.images import Image
+from torchpose._core.module_state import CpuModule
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
 from torchpose.measure._body_window import ScaledFrame, scale_frame, scales_of_faces
@@ -63,7 +64,7 @@ class _Look(NamedTuple):
     seen: Bool[Tensor, "N 2"]
 
 
-class MeanShiftHandTracker(nn.Module):
+class MeanShiftHandTracker(CpuModule):
     """Tracks hands by mean shift in likelihood maps of skin.
 
     1. Likelihood: the histogram h of the face's colours is averaged over time and back-projected,

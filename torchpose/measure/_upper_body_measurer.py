@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
-from torchpose._core.module_state import as_one_run
+from torchpose._core.module_state import CpuModule, as_one_run
 from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
 from torchpose.measure._face import FaceTracker, FaceTracks
@@ -125,7 +125,7 @@ class MeasurerState(NamedTuple):
     hands: HandBeliefs | MeanShiftHandState
 
 
-class UpperBodyMeasurer(nn.Module):
+class UpperBodyMeasurer(CpuModule):
     """Measures head, neck and hands of all persons in a video, frame by frame.
 
     Faces are detected and tracked. They give head and neck, the colours of skin, and the region of the

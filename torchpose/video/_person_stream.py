@@ -1,8 +1,8 @@
 """Track the poses of one person of a video, and decide whether left and right hand are swapped."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -152,12 +152,6 @@ class PersonStream(nn.Module):
         if association is not None:
             self.hands = [self.names.index(name) for name in ("hand_left", "hand_right")]
             self.exchanged = [self.names.index(_other_side(name)) for name in self.names]
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the tracker, as `to` asks for. Edges are compared on the CPU, where images are."""
-        if recurse:
-            self.tracker._apply(fn)
-        return super()._apply(fn, recurse=False)
 
     def init(self, number: int) -> PersonStreamState:
         """Return the state before the first frame of the person of this number."""

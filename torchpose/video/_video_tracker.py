@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -213,12 +213,6 @@ class VideoTracker(nn.Module):
         _ = self.smoother  # raises errors of the options before any work
         self.fps = float(fps)
         self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move the tracker of poses, as `to` asks for. Images are measured on the CPU, by OpenCV."""
-        if recurse:
-            self.stream._apply(fn)
-        return super()._apply(fn, recurse=False)
 
     @property
     def tracker(self) -> UpperBodyTracker:
