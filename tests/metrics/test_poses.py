@@ -136,6 +136,23 @@ def test_what_is_missing_has_no_gradient() -> None:
     assert bool((estimate.grad[2] != 0).all())
 
 
+@pytest.mark.parametrize(
+    "measured",
+    [metrics.joint_errors, metrics.joint_errors_3d, lambda x, _: metrics.jitter(x, 30.0)],
+)
+def test_missing_joints_leave_no_trace_in_gradients_of_others(measured) -> None:
+    estimate, truth = normal(6, 8, 3).requires_grad_(), normal(6, 8, 3, seed=1)
+    gone = torch.zeros(6, 8, dtype=torch.bool)
+    gone[0, 3], gone[1, :6] = True, True  # the head, and all but two
+    measured(estimate.masked_fill(gone[..., None], torch.nan), truth).nansum().backward()
+    assert estimate.grad is not None and bool(estimate.grad.isfinite().all())
+    assert not estimate.grad[gone].any()
+    alone = estimate[2:].detach().requires_grad_()
+    measured(alone, truth[2:]).sum().backward()
+    assert alone.grad is not None
+    torch.testing.assert_close(estimate.grad[2:, :6], alone.grad[:, :6])
+
+
 @pytest.mark.parametrize("n_frames", [1, 6, 7])
 def test_the_median_is_that_of_numpy_and_infinite_errors_count(n_frames: int) -> None:
     errors = normal(n_frames, 5).abs()
@@ -301,6 +318,8 @@ def test_bad_input_is_named() -> None:
         metrics.align(torch.zeros(8, 3), torch.zeros(8, 3), joints=[0, 1])
     with pytest.raises(InputError, match=r"probabilities in \[0, 1\]"):
         metrics.coverage(*gaussian_joints(2), levels=[1.5])
+    with pytest.raises(ShapeError, match=r"levels must have shape \[L\], got \[\]"):
+        metrics.coverage(*gaussian_joints(2), levels=0.5)
     with pytest.raises(InputError, match="three frames"):
         metrics.jitter(torch.zeros(2, 8, 3), 30.0)
 

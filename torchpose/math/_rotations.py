@@ -390,8 +390,11 @@ def procrustes(
     s, x = torch.where(use, source, 0.0), torch.where(use, target, 0.0)
     s_mean, x_mean = (points.sum(-2, keepdim=True) / count.clamp_min(1) for points in (s, x))
     rotation = _nearest_rotation(((x - x_mean) * weight).mT @ (s - s_mean))
-    rotation = rotation.masked_fill(count < 3, math.nan)
-    return RigidMotion(rotation, (x_mean - s_mean @ rotation.mT).squeeze(-2))
+    translation = x_mean - s_mean @ rotation.mT
+    few = count < 3
+    return RigidMotion(
+        rotation.masked_fill(few, math.nan), translation.masked_fill(few, math.nan).squeeze(-2)
+    )
 
 
 def motion_of_all(

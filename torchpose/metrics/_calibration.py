@@ -120,6 +120,7 @@ def coverage(
     """
     estimate = as_values("estimate", estimate, ["...", None, None])
     nominal = torch.as_tensor(levels, dtype=torch.float64, device=estimate.device)
+    check_shape("levels", nominal, ["L"])
     squared = mahalanobis_squared(estimate, covariance, truth, mask)
     flat = squared.reshape(-1, squared.shape[-1])
     count = (~flat.isnan()).sum(0)

@@ -91,7 +91,10 @@ def align(
         )
     part = None if mask is None else mask[..., chosen]
     motion = procrustes(estimate[..., chosen, :], truth[..., chosen, :], part)
-    points = estimate @ motion.rotation.mT + motion.translation[..., None, :]
+    missing = estimate.isnan().any(-1) | motion.translation.isnan().any(-1, keepdim=True)
+    turn, place = (part.nan_to_num() for part in motion)
+    points = _where_there(estimate, missing) @ turn.mT + place[..., None, :]
+    points = points.masked_fill(missing[..., None], math.nan)
     if covariance is not None:
         check_shape("covariance", covariance, [*estimate.shape, 3])
         covariance = as_values("covariance", covariance, ["...", None, None]).to(points)
@@ -138,11 +141,22 @@ def joint_errors(
     estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
     apart = estimate - truth
     missing = apart.isnan().any(-1)
-    if mask is not None:
-        missing = missing | ~mask
-    # what is missing is left out before the norm, through which its NaN would reach gradients
-    errors = torch.linalg.vector_norm(apart.masked_fill(missing[..., None], 0.0), dim=-1)
-    return errors.masked_fill(missing, math.nan)
+    return _lengths(apart, missing if mask is None else missing | ~mask)
+
+
+def _lengths(
+    vectors: Float[Tensor, "*batch D"], missing: Bool[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Return the lengths of vectors, NaN where they are missing."""
+    lengths = torch.linalg.vector_norm(_where_there(vectors, missing), dim=-1)
+    return lengths.masked_fill(missing, math.nan)
+
+
+def _where_there(
+    points: Float[Tensor, "*batch D"], missing: Bool[Tensor, "*batch"]
+) -> Float[Tensor, "*batch D"]:
+    """Return the points with zeros where they are missing, whose NaN would reach the gradients of others."""
+    return points.masked_fill(missing[..., None], 0.0)
 
 
 def joint_errors_2d(
@@ -350,4 +364,4 @@ def jitter(points: Float[Tensor, "*batch T J D"], fps: float) -> Float[Tensor, "
         )
     left, middle, right = points[..., :-2, :, :], points[..., 1:-1, :, :], points[..., 2:, :, :]
     acceleration = (right - 2 * middle + left) * fps**2
-    return torch.linalg.vector_norm(acceleration, dim=-1).nanmean(-2)
+    return _lengths(acceleration, acceleration.isnan().any(-1)).nanmean(-2)
