@@ -62,7 +62,8 @@ def test_a_camera_of_one_person_fits_the_images_too(tmp_path):
     expected = CameraRig([CAMERA]).scaled(240, 320)
     torch.testing.assert_close(camera.matrix, expected.matrix[0])
     assert camera.image_size == (320, 240)
-    assert "scaled from 640 x 480" in notes[0] and "undistort keypoints or images" in notes[1]
+    assert "scaled from 640 x 480" in notes[0] and len(notes) == 1
+    torch.testing.assert_close(camera.distortions, CAMERA.distortions)
     camera, notes = resolve_camera(given, None, (632, 470), None, "clip.mp4")
     assert camera.image_size == (632, 470) and torch.equal(camera.matrix, CAMERA.matrix)
     with pytest.raises(CameraError, match="images of another shape are cut"):

@@ -173,6 +173,19 @@ def test_another_camera_is_mapped_to_the_priors(prior, scene):
     torch.testing.assert_close(mapped, second.joints2d, rtol=1e-2, atol=2.0)
 
 
+def test_a_note_says_that_a_lens_is_not_straightened(prior, scene):
+    def noted(camera):
+        tracker = UpperBodyTracker(prior, camera, method="mkf-fixed")
+        state = tracker.init(1, NAMES)
+        _, live = tracker.advance(state, scene[1][None, :2])
+        tracks = tracker(scene[1][None, :2], names=NAMES), live
+        return ["distortions are not applied" in " ".join(track.notes) for track in tracks]
+
+    numbers = (525.0, 525.0, 319.5, 239.5, 640, 480)
+    assert noted(PinholeCamera(*numbers, distortions=[-0.2, 0.05])) == [True, True]
+    assert noted(PinholeCamera(*numbers, distortions=[0.0] * 5)) == [False, False]
+
+
 def test_confidence_zero_is_missing_and_low_confidence_counts_less(prior, scene):
     _, keypoints = scene
     tracker = UpperBodyTracker(prior, demo_camera(), method="mkf-fixed")

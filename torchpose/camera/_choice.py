@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchpose.camera._lens import is_distorted
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import intrinsics, scale_matrix
 from torchpose.camera._rig import CameraRig
@@ -58,10 +57,6 @@ def resolve_camera(
         camera, notes = fit_to_size(camera, size, source)
         if size is not None and camera.image_size is not None and camera.image_size != size:
             camera = _of_size(camera, camera.matrix, size)  # without the padding of a codec
-        if is_distorted(camera.distortions, camera.fisheye):
-            notes += (
-                "the camera's distortions are not applied: undistort keypoints or images beforehand",
-            )
         return camera, (*notes, *_doubts_about(camera))
     if matrix is not None:
         camera = _of_pixels(PinholeCamera.from_matrix(matrix, *(size or (None, None))), source)

@@ -26,6 +26,7 @@ from torchpose._core.module_state import (
 )
 from torchpose._core.stream_settings import StreamSettings, check_settings, settings_of
 from torchpose._core.uncompiled import uncompiled
+from torchpose.camera._lens import is_distorted
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._tilt import angles_of_up
 from torchpose.errors import InputError
@@ -73,6 +74,7 @@ from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model
 from torchpose.upper_body._screening import screen_joints
 from torchpose.upper_body._tracker_options import MethodOptions
 
+_LENS = "the camera's distortions are not applied: undistort keypoints or images beforehand"
 _NO_EXPORT = (
     "UpperBodyTracker, which chooses its filters by what was measured,",
     "a step of a filter of torchpose.filters",
@@ -112,6 +114,7 @@ class UpperBodyTracker(WideModule):
         prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
         camera: the camera that took the keypoints. Those of another camera than the prior's are mapped to
             it, and those of a camera that looks up or down or is rolled to a level one, if its `up` tells.
+            Its distortions are not applied, which a note says: undistort keypoints or images beforehand.
         method: the name of an estimator, one of `METHODS`. The default depends on what is measured:
             "articulated" where wrists stand for the prior's hands, or an option of bones is given, and
             neither `steady` nor an option of another method is; else "multiple-model" where the prior has
@@ -192,6 +195,8 @@ class UpperBodyTracker(WideModule):
         of_windows = steady is not None or window is not None
         self._chosen = choose_method(prior, method, smoothing, self.fps, options, of_windows)
         self.method, self.notes = self._chosen.method, self._chosen.notes
+        distorted = is_distorted(self.camera.distortions, self.camera.fisheye)
+        self._lens_notes = (_LENS,) if distorted else ()
         self.smoothing = smoothing
         self.calibrated = calibrated
         self.frame = frame
@@ -471,7 +476,7 @@ class UpperBodyTracker(WideModule):
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
         """Return the notes about the choice of the method and about the kinds of neck and hands."""
         chosen = self.notes if method == self.method else ()
-        return chosen + picked.notes + picked.hand_notes(estimator.knows_wrists)
+        return self._lens_notes + chosen + picked.notes + picked.hand_notes(estimator.knows_wrists)
 
     def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
         info = self.prior.info
