@@ -397,6 +397,9 @@ def test_a_stretch_without_any_measurement_is_bounded(prior):
     tracker = UpperBodyTracker(prior, demo_camera(), fps=10.0)
     with pytest.raises(InputError, match="57 frames, from frame 15 on, longer"):
         tracker(keypoints, names=NAMES)
+    for max_gap in (-1.0, math.nan, "5"):
+        with pytest.raises(InputError, match="max_gap must be at least 0 seconds"):
+            UpperBodyTracker(prior, demo_camera(), max_gap=max_gap)
     whole = UpperBodyTracker(prior, demo_camera(), fps=10.0, max_gap=None)
     assert torch.isfinite(whole(keypoints, names=NAMES).joints3d).all()
 

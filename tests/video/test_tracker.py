@@ -1,5 +1,6 @@
 """Persons of a video who leave, return and cross, rendered."""
 
+import math
 import sys
 import weakref
 from dataclasses import replace
@@ -305,13 +306,23 @@ def forget_constants():
                 value.cache_clear()
 
 
+def test_no_smoothing_and_no_bound_may_be_numbers(prior):
+    tracker = VideoTracker(prior, demo_camera(), smoothing=0, max_gap=math.inf)
+    assert tracker.smoother is None and tracker.gap == sys.maxsize
+    assert tracker.step(tracker.init(), np.zeros((480, 640, 3), np.uint8))[1] == []
+
+
 def test_bad_use_is_refused(prior):
     with pytest.raises(InputError, match="hands must be one of"):
         VideoTracker(prior, demo_camera(), hands="feet")
     with pytest.raises(InputError, match="candidates"):
         VideoTracker(prior, demo_camera(), hands="mean-shift", candidates=True)
-    with pytest.raises(InputError, match="max_gap"):
-        VideoTracker(prior, demo_camera(), max_gap=0.0)
+    for max_gap in (0.0, "5", True):
+        with pytest.raises(InputError, match="max_gap must be positive"):
+            VideoTracker(prior, demo_camera(), max_gap=max_gap)
+    for option in ({"measurement_std": 3.0}, {"neck": "neck"}, {"min_confidence": 0.5}):
+        with pytest.raises(InputError, match=f"{next(iter(option))} is of keypoints"):
+            VideoTracker(prior, demo_camera(), **option)
     tracker = VideoTracker(prior, demo_camera())
     small = np.zeros((20, 30, 3), np.uint8)
     with pytest.raises(

@@ -13,6 +13,7 @@ from torchpose._core.checks import (
     check_floating,
     check_shape,
     check_tensors,
+    number_of,
     refuse_export,
     refuse_half,
 )
@@ -204,6 +205,10 @@ class UpperBodyTracker(WideModule):
         if neck is not None:
             check_choice("neck", neck, NECK_KINDS)
         self.neck = neck
+        if max_gap is not None and not number_of(max_gap) >= 0:
+            raise InputError(
+                f"max_gap must be at least 0 seconds, or None for no bound, got {max_gap!r}"
+            )
         self.max_gap = max_gap
         self.outliers = outliers
         self.dtype = working_precision("dtype", options.get("dtype", torch.float64))

@@ -1,5 +1,6 @@
 """Track the poses of all persons in a video."""
 
+import math
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_rgb
+from torchpose._core.checks import check_rgb, number_of
 from torchpose._core.images import Image
 from torchpose._core.module_state import derived
 from torchpose._core.uncompiled import uncompiled
@@ -181,14 +182,18 @@ class VideoTracker(nn.Module):
         for name, value in (("max_persons", max_persons), ("seed", seed)):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
                 raise InputError(f"{name} must be a whole number, got {value!r}")
-        if max_gap is not None and not max_gap > 0:
-            raise InputError(f"max_gap must be positive, got {max_gap}")
+        if max_gap is not None and not number_of(max_gap) > 0:
+            raise InputError(
+                f"max_gap must be positive, seconds, or None for never, got {max_gap!r}"
+            )
         if candidates and hands == "mean-shift":
             raise InputError(f"candidates need hands='learnt' or 'grid', got {hands!r}")
         self.measurer: UpperBodyMeasurer | KeypointMeasurer
         if detector is None:
-            if min_confidence is not None:
-                raise InputError("min_confidence is of keypoints: give a detector, or leave it out")
+            given: dict[str, Any] = {"min_confidence": min_confidence, **options}
+            for option in ("min_confidence", "measurement_std", "neck"):
+                if given.get(option) is not None:
+                    raise InputError(f"{option} is of keypoints: give a detector, or leave it out")
             self.measurer = UpperBodyMeasurer(
                 prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
             )
@@ -210,9 +215,11 @@ class VideoTracker(nn.Module):
         self.stream = PersonStream(tracker, self.measurer.names, seed, association)
         self.smoothing = smoothing
         self._options: dict[str, Any] = {"fps": fps, "max_gap": None, **options}
-        _ = self.smoother  # raises errors of the options before any work
+        smoother = self.smoother  # raises errors of the options before any work
+        self.smoothing = None if smoother is None else smoother.smoothing
         self.fps = float(fps)
-        self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
+        away = math.inf if max_gap is None else max_gap * fps
+        self.gap = sys.maxsize if math.isinf(away) else min(round(away), sys.maxsize)
 
     @property
     def tracker(self) -> UpperBodyTracker:
