@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tests.data import data_dir_or_skip
 from torchpose.camera import (
+    CameraRig,
     PinholeCamera,
     ViewRange,
     lift,
@@ -316,6 +317,16 @@ def test_file_round_trip(tmp_path):
         assert (other.image_size, other.fisheye) == (camera.image_size, camera.fisheye)
     assert torch.equal(PinholeCamera.load(path, "cam.2").matrix, cameras[1].matrix)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_was_read_can_be_written(tmp_path):
+    save_cameras([PinholeCamera(1, 1, 0, 0, name=name) for name in "ab"], tmp_path / "read.toml")
+    cameras = load_cameras(tmp_path / "read.toml")
+    save_cameras(cameras, tmp_path / "written.toml")
+    assert list(load_cameras(tmp_path / "written.toml")) == ["a", "b"]
+    for wrong in (CameraRig(list(cameras.values())), ["a"], None):
+        with pytest.raises(InputError, match="cameras must be PinholeCameras"):
+            save_cameras(wrong, tmp_path / "written.toml")
 
 
 def test_one_camera_needs_no_name(tmp_path):

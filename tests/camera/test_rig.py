@@ -71,6 +71,16 @@ def test_scaled_keeps_the_middles_of_pixels_in_place():
     )
 
 
+def test_rigs_of_a_rig_have_tensors_of_their_own():
+    rig = CameraRig(make_cameras())
+    before = {name: value.clone() for name, value in rig.state_dict().items()}
+    for other in (rig.scaled(120, 160), rig.select([0, 1, 2])):
+        other.load_state_dict({name: value + 1 for name, value in before.items()})
+    assert all(torch.equal(value, before[name]) for name, value in rig.state_dict().items())
+    with pytest.raises(InputError, match="precision of CameraRig"):
+        rig.half()
+
+
 @pytest.mark.parametrize("path", ["cameras.toml", Path("cameras.toml")])
 def test_a_file_is_no_rig(path):
     with pytest.raises(CameraError, match=r"got 'cameras\.toml'; load_cameras reads them"):
@@ -198,6 +208,11 @@ def test_undistort_colour_and_nothing_to_do():
         rig.undistort(np.zeros((3, 240, 320), bool))
     with pytest.raises(CameraError, match="of 3 cameras"):
         rig.undistort(np.zeros((2, 480, 640), bool))
+    with pytest.raises(InputError, match=r"images must be of bool, uint8, .* got int64"):
+        bent.undistort(torch.zeros(3, 480, 640, dtype=torch.int64))
+    for dtype in (torch.int64, torch.float16):
+        with pytest.raises(InputError, match="points must be"):
+            bent.undistort_points(torch.zeros(3, 5, 2, dtype=dtype))
     with pytest.raises(CameraError, match=r"\[\.\.\., C, H, W\]"):
         rig.undistort(np.zeros((480, 640), bool))
 

@@ -6,7 +6,7 @@ Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions 
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -359,12 +359,14 @@ def list_names(cameras: Mapping[str, PinholeCamera]) -> str:
     )
 
 
-def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
+def save_cameras(
+    cameras: Sequence[PinholeCamera] | Mapping[str, PinholeCamera], path: str | Path
+) -> None:
     """Write cameras as TOML, one table each, atomically: an interrupted write leaves no partial file.
 
     Args:
-        cameras: one or more, with different names; those without a name are called ``cam_01``, ...
-            (a single one ``camera``).
+        cameras: one or more, with different names, or those of `load_cameras`; those without a name are
+            called ``cam_01``, ... (a single one ``camera``).
         path: the file, which is replaced.
 
     Raises:
@@ -372,6 +374,11 @@ def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
     """
     from torchpose._core.files import atomic_path  # io imports this module
 
+    given = cameras.values() if isinstance(cameras, Mapping) else cameras
+    cameras = list(given) if isinstance(given, Iterable) else [given]
+    if not all(isinstance(camera, PinholeCamera) for camera in cameras):
+        kinds = [type(camera).__name__ for camera in cameras]
+        raise InputError(f"cameras must be PinholeCameras in a list, got {kinds}")
     names = [c.name or (f"cam_{i:02d}" if len(cameras) > 1 else "camera")
              for i, c in enumerate(cameras, start=1)]  # fmt: skip
     if not names or len(set(names)) != len(names):

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_floating, check_shape
+from torchpose._core.checks import check_floating, check_shape, refuse_half
+from torchpose._core.module_state import NoHalfModule
 from torchpose._core.wording import counted
 from torchpose.camera._lens import (
     OPENCV_DISTORTIONS,
@@ -23,6 +24,7 @@ from torchpose.camera._pinhole import PinholeCamera, load_cameras
 from torchpose.camera._projection import scale_matrix
 from torchpose.errors import CameraError, InputError
 
+_IMAGES = ("bool", "uint8", "uint16", "int16", "float32", "float64")
 _LARGEST_OFF = 1.0  # pixels, between a point and its inverse distorted again
 
 
@@ -38,7 +40,7 @@ class RigView(NamedTuple):
     depth: Tensor
 
 
-class CameraRig(nn.Module):
+class CameraRig(NoHalfModule):
     """Holds C calibrated cameras with poses in one room.
 
     x_camera = rotation x_world + translation, pixels by the matrix K (BL 3). Camera axes: x right,
@@ -179,7 +181,8 @@ class CameraRig(nn.Module):
         sx, sy = width / old[:, 1], height / old[:, 0]
         matrix = scale_matrix(self.matrix, sx, sy)
         rig = copy.copy(self)
-        rig._buffers = {**dict(self.named_buffers()), "matrix": matrix}
+        own = {name: b.clone() for name, b in self.named_buffers()}
+        rig._buffers = {**own, "matrix": matrix}
         rig.sizes = ((int(height), int(width)),) * len(self)
         return rig
 
@@ -197,12 +200,15 @@ class CameraRig(nn.Module):
             The same kind and shape.
 
         Raises:
-            CameraError: another number of cameras, or another size than the cameras'.
+            CameraError: another number of cameras, or another size than the cameras'. InputError: numbers
+            that OpenCV does not interpolate.
         """
         array = images.numpy(force=True) if isinstance(images, Tensor) else np.asarray(images)
         colour = array.ndim >= 4 and array.shape[-1] == 3 and array.shape[-4] == len(self)
         sides = array.shape[-4:-1] if colour else array.shape[-3:]
         self.check_images("images", sides)
+        if array.dtype.name not in _IMAGES:
+            raise InputError(f"images must be of {', '.join(_IMAGES)}, got {array.dtype}")
         flat = array.reshape(-1, *sides, *array.shape[-1:]) if colour else array.reshape(-1, *sides)
         out = np.empty_like(flat)
         for c in range(len(self)):
@@ -220,11 +226,15 @@ class CameraRig(nn.Module):
 
         Returns:
             [..., C, N, 2], pixels; the same tensor where no lens distorts. NaN where the distortions
-            have no inverse: no ray in front of the camera ends there.
+            have no inverse: no ray in front of the camera ends there. Gradients do not pass a lens that
+            distorts.
 
         Raises:
-            CameraError: another number of cameras. ShapeError: no such points.
+            CameraError: another number of cameras. ShapeError: no such points. InputError: whole numbers,
+            or half precision.
         """
+        check_floating("points", points)
+        refuse_half("points", points)
         check_shape("points", points, ["...", "C", "N", 2])
         if points.shape[-3] != len(self):
             raise CameraError(
