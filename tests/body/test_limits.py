@@ -77,6 +77,14 @@ def test_dtype_and_file():
     assert limits.log_prob(STATES.float()).dtype == torch.float32
 
 
+def test_limits_do_not_follow_the_tensors_that_they_were_given():
+    lower, upper = torch.zeros(12), torch.ones(12)
+    limits = JointLimits(lower, upper, upper)
+    lower += 5
+    limits.softness.mul_(2)
+    assert not limits.lower.any() and torch.equal(limits.upper, torch.ones(12))
+
+
 def test_bad_input():
     with pytest.raises(InputError, match="at least one recorded state"):
         JointLimits.fit(STATES[:0])

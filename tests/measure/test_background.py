@@ -1,5 +1,8 @@
 """Foreground of drawn scenes whose background is known."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -116,6 +119,15 @@ def test_reset_and_sizes():
         model.step(large[:100], FACE)
     model.reset()
     assert (model.step(large[:100], NOBODY) == 255).all()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_copy_begins_anew_with_the_same_settings(copied):
+    model, frames = BackgroundModel(history=50, settle=9, wait=1), [scene(t) for t in range(6)]
+    expected = [model.step(frame, FACE) for frame in frames]
+    other = copied(model)
+    assert (other.history, other.settle, other.wait) == (50, 9, 1)
+    assert all(map(np.array_equal, [other.step(frame, FACE) for frame in frames], expected))
 
 
 def test_the_region_is_about_the_face_and_below_it():

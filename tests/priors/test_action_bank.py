@@ -1,5 +1,6 @@
 """Several actions at once: against the single spaces, against enumeration over paths, and recognition."""
 
+import copy
 import itertools
 import math
 from dataclasses import replace
@@ -53,6 +54,28 @@ def test_padding_changes_nothing(bank, spaces):
         torch.testing.assert_close(
             bank.clamp_postures(postures, own, j), space.clamp_postures(postures, j)
         )
+
+
+def test_postures_of_another_precision_are_those_of_the_bank(bank, spaces):
+    postures = some_postures().float()
+    both = postures.double()
+    assert torch.equal(bank.recognise(postures), bank.recognise(both))
+    own, j = torch.zeros(60, dtype=torch.long), torch.zeros(60, dtype=torch.long)
+    assert torch.equal(bank.inside(postures, own, j), bank.inside(both, own, j))
+    z = spaces[0].project(both)
+    assert torch.equal(spaces[0].project(postures), z)
+    assert spaces[0].reconstruct(z.float()).dtype == torch.float64
+    assert copy.deepcopy(bank).float().log_likelihood(both).dtype == torch.float32
+    for model in (bank, spaces[0]):
+        with pytest.raises(InputError, match="half precision"):
+            model.half()
+
+
+def test_a_space_of_fewer_dimensions_has_tensors_of_its_own(spaces):
+    before = {name: value.clone() for name, value in spaces[0].state_dict().items()}
+    fewer = spaces[0].with_dimensions(2)
+    fewer.load_state_dict({name: value + 1 for name, value in fewer.state_dict().items()})
+    assert all(torch.equal(v, before[name]) for name, v in spaces[0].state_dict().items())
 
 
 def test_every_particle_has_an_action_of_its_own(bank):

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.module_state import register_given
 from torchpose.errors import InputError, ShapeError
 from torchpose.math._rotations import within_unit_ball
 
@@ -55,7 +56,7 @@ class JointLimits(nn.Module):
         for name, value in (("lower", lower), ("upper", upper), ("softness", softness)):
             check_shape(name, value, [columns])
             check_finite(name, value)
-            self.register_buffer(name, value)
+            register_given(self, name, value)
         if bool((upper < lower).any()):
             column = int(torch.nonzero(upper < lower)[0])
             raise InputError(f"upper limits must not be below lower ones, see column {column}")

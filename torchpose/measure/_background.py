@@ -1,7 +1,7 @@
 """Detect foreground against a static background, and motion between frames."""
 
 import threading
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -66,7 +66,7 @@ class BackgroundModel:
       empty.
 
     The state is kept inside, because OpenCV keeps its own: use one object for each video, in the
-    order of its frames, or call `reset`.
+    order of its frames, or call `reset`. A copy, pickled or not, begins anew.
 
     Args:
         history: frames over which MOG2 learns. threshold: squared distance to a Gaussian, in
@@ -112,6 +112,10 @@ class BackgroundModel:
         self.history, self.threshold, self.settle = history, threshold, settle
         self.wait, self.shadows = wait, shadows
         self.reset()
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
+        # OpenCV's model can be neither copied nor pickled
+        return type(self), (self.history, self.threshold, self.settle, self.wait, self.shadows)
 
     def reset(self) -> None:
         """Reset the state, for another video."""

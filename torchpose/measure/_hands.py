@@ -149,7 +149,14 @@ class HandTracker(CpuModule):
         self.windows = HandWindows(s, rate, prior, self.skin, self.motion, self.likelihood, network)
 
     def train(self, mode: bool = True) -> Self:
-        """Set the mode, as a model in training does; the network learns nothing here, and stays as it is."""
+        """Set the mode, as a model in training does, of all but the network, which learns nothing here.
+
+        Args:
+            mode: whether the model trains.
+
+        Returns:
+            Itself.
+        """
         super().train(mode)
         if self.network is not None:
             self.network.eval()

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_finite, check_rate, check_shape
-from torchpose._core.module_state import derived, register_given
+from torchpose._core.module_state import NoHalfModule, derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
@@ -96,7 +96,7 @@ class _Products(NamedTuple):
     carry: Tensor
 
 
-class LimbConditionals(nn.Module):
+class LimbConditionals(NoHalfModule):
     """Holds Gaussians over the rotations between connected parts, and over those from frame to frame.
 
     p(x_j | x_i, c_ij) ~ F(q_i, N(x_ij; mu_ij, Sigma_ij)),   q_ij = q_i^-1 q_j               (DX 3)

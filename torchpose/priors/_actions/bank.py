@@ -6,10 +6,11 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.estimates import check_number_range
+from torchpose._core.module_state import NoHalfModule
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
 from torchpose.errors import FileFormatError, InputError
@@ -36,7 +37,7 @@ from torchpose.priors._actions.stack import (
 )
 
 
-class ActionBank(nn.Module):
+class ActionBank(NoHalfModule):
     """Holds the action spaces of several actions, padded to one size, with one more state: none of them.
 
     The likelihood of a posture phi under action a is a tube of Gaussians around the mean performance
@@ -134,7 +135,7 @@ class ActionBank(nn.Module):
         check_shape("postures", postures, ["...", POSTURE_DIM])
         flat = self.basis.transpose(0, 1).flatten(1)  # [36, A D]
         offset = (self.mean[:, None] @ self.basis).flatten()
-        return (postures @ flat - offset).unflatten(-1, self.basis.shape[::2])
+        return (postures.to(flat) @ flat - offset).unflatten(-1, self.basis.shape[::2])
 
     def match(
         self,
@@ -239,6 +240,7 @@ class ActionBank(nn.Module):
         Raises:
             ShapeError: other than 36 angles.
         """
+        postures = postures.to(self.mean)
         z = self.project(postures)
         std = self.info.spread * self.std
         used = torch.arange(std.shape[-1], device=z.device) < self.n_dimensions[:, None]  # [A, D]
@@ -394,7 +396,7 @@ class ActionBank(nn.Module):
         for name, size in zip(BANK_FILE.indices, tensors["performance"].shape[1:], strict=True):
             check_number_range(path, name, tensors[name], 1, size)
         bank = cls.__new__(cls)
-        nn.Module.__init__(bank)
+        NoHalfModule.__init__(bank)
         bank.info = info
         for name, value in tensors.items():
             bank.register_buffer(name, value)

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.module_state import NoHalfModule, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
@@ -27,7 +28,7 @@ from torchpose.priors._actions.gate import (
 from torchpose.priors._actions.polar_limbs import POSTURE_DIM, check_limbs
 
 
-class ActionSpace(nn.Module):
+class ActionSpace(NoHalfModule):
     """Holds the action model Gamma = (Omega, g, sigma_k) of aSpace, over postures of 36 angles in degrees.
 
     With phi a posture, z = (phi - m) U its projection on the first D principal axes (Omega),
@@ -111,7 +112,7 @@ class ActionSpace(nn.Module):
             check_finite(name, value)
             if name in ("std", "match_std") and not bool((value > 0).all()):
                 raise InputError(f"{name} must be positive, degrees, got {float(value.min()):g}")
-            self.register_buffer(name, value)
+            register_given(self, name, value)
 
     fit = staticmethod(moved_function("ActionSpace.fit", "torchpose.learning.fit_action_space"))
     fit_synchronised = staticmethod(
@@ -173,7 +174,7 @@ class ActionSpace(nn.Module):
             ShapeError: other than 36 angles.
         """
         check_shape("postures", postures, ["...", POSTURE_DIM])
-        return (postures - self.mean) @ self.basis
+        return (postures.to(self.mean) - self.mean) @ self.basis
 
     def reconstruct(self, z: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch 36"]:
         """Return the posture m + U z.
@@ -188,7 +189,7 @@ class ActionSpace(nn.Module):
             ShapeError: another number of dimensions.
         """
         check_shape("z", z, ["...", self.n_dimensions])
-        return self.mean + z @ self.basis.mT
+        return self.mean + z.to(self.mean) @ self.basis.mT
 
     # --- the gate ---------------------------------------------------------------------------------
 

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.module_state import NoHalfModule
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose.errors import FileFormatError, InputError, ShapeError
@@ -90,7 +91,7 @@ def join_sequences(
     return torch.cat([part.detach().double() for part in parts]), [len(part) for part in parts]
 
 
-class BackConstrainedGPLVM(nn.Module):
+class BackConstrainedGPLVM(NoHalfModule):
     """Holds a manifold of poses: x = f(z) + noise with f a Gaussian process, z = g(x).
 
     k(z, z') = beta exp(-gamma_z / 2 ||z - z'||^2) + beta_0   (MR 14)
