@@ -124,6 +124,23 @@ def test_mean_of_both_signs_of_a_half_turn():
     assert mean.abs().tolist() == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    "vectors",
+    [
+        torch.zeros(3, 3),
+        torch.tensor([[0.0, 0.1, 0.0], [0.0, -0.3, 0.0]]),
+        torch.tensor([[0.1, 0.2, 0.3]]),
+    ],
+)
+def test_means_of_equal_rotations_and_of_turns_about_one_axis_have_gradients(vectors):
+    vectors = vectors.double().requires_grad_()
+    weights = torch.linspace(0.5, 1, len(vectors)).double().requires_grad_()
+    assert torch.autograd.gradcheck(mean_rotation, (vectors, weights))
+    with torch.no_grad():
+        expected = mean_rotation(vectors, weights)
+    assert torch.equal(mean_rotation(vectors, weights), expected)
+
+
 def test_a_mean_that_is_lost_stays_alone():
     vectors = torch.tensor([[0.1, 0.2, 0.3], [0.0, 0.5, 0.1]], dtype=torch.float64).repeat(3, 1, 1)
     weights = torch.tensor([[0.5, 0.5], [0.5, 0.5], [math.nan, 0.5]], dtype=torch.float64)
@@ -135,6 +152,8 @@ def test_a_mean_that_is_lost_stays_alone():
 
 
 def test_wrong_sizes_are_named():
+    with pytest.raises(ShapeError, match=r"second must have shape \[\.\.\., 3\], got \[4\]"):
+        compose(torch.zeros(3), torch.zeros(4))
     with pytest.raises(ShapeError, match="vector must have shape"):
         quaternion_vector_to_matrix(torch.zeros(4))
     with pytest.raises(ShapeError, match="rotation must have shape"):

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_shape
+from torchpose._core.checks import check_choice, check_floating, check_shape
 from torchpose._core.module_state import outside_inference
 from torchpose._core.value_pairs import as_pair
 from torchpose.math._gaussian import safe_eigh
@@ -84,13 +84,14 @@ def euler_to_matrix(
         R [..., 3, 3], body axes to camera axes.
 
     Raises:
-        ShapeError: the last dimension is not 3. InputError: another order.
+        ShapeError: the last dimension is not 3. InputError: another order, or whole numbers.
 
     Reference: Burke & Lasenby, equation (3).
 
     >>> euler_to_matrix(torch.tensor([0.0, 0.0, 0.5]))[2]  # yaw turns about y
     tensor([-0.4794,  0.0000,  0.8776])
     """
+    check_floating("angles", angles)
     check_shape("angles", angles, ["...", 3])
     _check_order(order)
     factors, weights = _EULER_TERMS[order]
@@ -275,10 +276,15 @@ def compose(
     Returns:
         Quaternion vector [..., 3] in the unit ball.
 
+    Raises:
+        ShapeError: the last dimension is not 3, as of quaternions.
+
     >>> quarter = torch.tensor([0.0, 0.5**0.5, 0.0])
     >>> compose(quarter, -quarter)
     tensor([0., 0., 0.])
     """
+    for name, vector in (("first", first), ("second", second)):
+        check_shape(name, vector, ["...", 3])
     return quaternion_to_vector(_product(vector_to_quaternion(first), vector_to_quaternion(second)))
 
 
@@ -346,8 +352,17 @@ def mean_rotation(
     check_shape("vectors", vectors, ["...", None, 3])
     quaternions = vector_to_quaternion(vectors)
     weighted = quaternions if weights is None else quaternions * weights[..., None]
-    _, axes = safe_eigh(weighted.mT @ quaternions)
-    return quaternion_to_vector(axes[..., -1])
+    matrix = weighted.mT @ quaternions
+    mean = safe_eigh(matrix.detach())[1][..., -1]
+    if (
+        torch.is_grad_enabled()
+    ):  # eigenvalues that are equal, as of turns about one axis, have no gradients
+        size = torch.finfo(matrix.dtype).eps * matrix.detach().diagonal(dim1=-2, dim2=-1).sum(-1)
+        apart = size[..., None] * torch.arange(4).to(matrix)
+        same = safe_eigh(matrix + torch.diag_embed(apart))[1][..., -1]
+        same = same * (same * mean).detach().sum(-1, keepdim=True).sign()
+        mean = mean + (same - same.detach())
+    return quaternion_to_vector(mean)
 
 
 class RigidMotion(NamedTuple):

@@ -114,7 +114,8 @@ def unscented_transform(
 
     Args:
         function: maps points [..., S, D] to [..., S, E].
-        mean: [..., D]. covariance: [..., D, D]. centre, directions: see `sigma_points`.
+        mean: [..., D]. covariance: [..., D, D]. centre, directions: see `sigma_points`. Gradients with
+            respect to a covariance with equal eigenvalues need "cholesky".
 
     Returns:
         Mean [..., E] and covariance [..., E, E].
@@ -149,7 +150,7 @@ def unscented_update(
     Args:
         function: h, maps points [..., S, D] to [..., S, Z].
         mean: mu [..., D]. covariance: Sigma [..., D, D]. measured: z [..., Z]. noise: R [..., Z, Z].
-        centre, directions: see `sigma_points`.
+        centre, directions: see `unscented_transform`.
 
     Returns:
         mu' [..., D], Sigma' [..., D, D] and the log-likelihood log N(z; mu_h, S) [...].
