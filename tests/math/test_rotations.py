@@ -100,7 +100,9 @@ def test_rodrigues_has_a_gradient_at_zero():
 def test_bad_input():
     with pytest.raises(InputError, match="zxy, zyx"):
         euler_to_matrix(torch.zeros(3), "xyz")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"angles must be a floating-point tensor, got torch\.int64"):
+    with pytest.raises(
+        InputError, match=r"angles must be a floating-point tensor, got torch\.int64"
+    ):
         euler_to_matrix(torch.zeros(3, dtype=torch.int64))
     with pytest.raises(ShapeError, match="angles"):
         euler_to_matrix(torch.zeros(4))

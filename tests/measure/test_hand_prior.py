@@ -7,7 +7,8 @@ import pytest
 import torch
 
 import torchpose
-from torchpose.errors import InputError
+from torchpose.errors import InputError, PriorError
+from torchpose.measure import HandTracker, MeanShiftHandTracker
 from torchpose.measure._hand_prior import FACE_HEIGHT, HandPrior
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._prior_file import PriorInfo
@@ -95,3 +96,12 @@ def test_a_prior_behind_the_camera_is_refused(prior):
     arm = GaussianMixture(prior.left.weights, means, prior.left.covariances)
     with pytest.raises(InputError, match="depths above"):
         HandPrior.from_prior(UpperBodyPrior(arm, arm))
+
+
+@pytest.mark.parametrize("tracker", [HandTracker, lambda prior: MeanShiftHandTracker(prior=prior)])
+def test_trackers_of_hands_take_the_prior_over_poses(prior, tracker):
+    table = HandPrior.from_prior(prior)
+    assert torch.equal(tracker(prior).prior.table, table.table)
+    assert tracker(table).prior is table
+    with pytest.raises(PriorError, match="prior must be an UpperBodyPrior, got str"):
+        tracker("kinect-upper-body")

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import check_shape
 from torchpose._core.module_state import derived, register_given
-from torchpose.errors import InputError
+from torchpose.errors import InputError, PriorError
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
@@ -51,15 +51,21 @@ class HandPrior(nn.Module):
     table: Tensor
 
     @classmethod
-    def from_prior(cls, prior: UpperBodyPrior) -> "HandPrior":
-        """Return the tables of a prior over poses, for any camera; computed once for each.
+    def from_prior(cls, prior: "UpperBodyPrior | HandPrior") -> "HandPrior":
+        """Return the tables of a prior over poses, for any camera; what holds tables is returned as it is.
 
         The depth of the head is summed over five nodes of Gauss-Hermite quadrature; given it, the
         offsets are Gaussian for every component, so nothing is sampled.
 
         Raises:
-            InputError: a prior whose heads are all behind or too near the camera.
+            InputError: a prior whose heads are all behind or too near the camera. PriorError: something else.
         """
+        if isinstance(prior, HandPrior):
+            return prior
+        if not isinstance(prior, UpperBodyPrior):
+            raise PriorError(
+                f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
+            )
         focal = (prior.info.fx, prior.info.fy)
         arms = (prior.left, prior.right)
         sources = tuple(x for arm in arms for x in arm.parameters_tuple())

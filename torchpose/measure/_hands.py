@@ -44,6 +44,7 @@ from torchpose.measure._hand_windows import HandView, HandWindows, HandWindowSta
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 _NEAR = 4  # cells about a hand that belong to it
 _UNKNOWN, _SUREST = 0.5, 1e-3  # probability that a hand is gone: at first, and at the least
@@ -96,7 +97,7 @@ class HandTracker(CpuModule):
     `step` is `look`, which the images and faces alone decide and which may run ahead, and then `find`.
 
     Args:
-        prior: of hands given the face.
+        prior: the prior over poses, which gives that of hands given the face, or the latter itself.
         settings: constants. fps: frames per second of the video.
         network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
             takes every hand to be somewhere.
@@ -111,8 +112,7 @@ class HandTracker(CpuModule):
     Example:
         >>> import numpy as np, torch, torchpose
         >>> from torchpose.measure import HandTracker
-        >>> from torchpose.measure._hand_prior import HandPrior
-        >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
+        >>> tracker = HandTracker(torchpose.load_prior("kinect-upper-body"))
         >>> frame = np.full((120, 160, 3), 90, np.uint8)
         >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
         >>> state, hands = tracker.step(tracker.init(), frame, face, number)
@@ -122,7 +122,7 @@ class HandTracker(CpuModule):
 
     def __init__(
         self,
-        prior: HandPrior,
+        prior: UpperBodyPrior | HandPrior,
         settings: HandSettings | None = None,
         fps: float = 30.0,
         network: HandNetwork | None = None,
@@ -131,7 +131,8 @@ class HandTracker(CpuModule):
         super().__init__()
         if not (math.isfinite(fps) and fps > 0):
             raise InputError(f"fps must be positive, got {fps}")
-        self.prior, self.settings, self.fps = prior, settings or HandSettings(), fps
+        self.prior = prior = HandPrior.from_prior(prior)
+        self.settings, self.fps = settings or HandSettings(), fps
         s, rate = self.settings, 30.0 / fps
         self.rate, self.network, self.elbows = rate, network, elbows
         self.skin = SkinModel(

@@ -25,6 +25,7 @@ from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._mean_shift import mean_shift
 from torchpose.measure._persons import match_states, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinModel, SkinState, parts_of_persons
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 Likelihood = Literal["back-projection", "ratio"]
 _THRESHOLDS = {"back-projection": 0.1, "ratio": 0.25}
@@ -84,8 +85,8 @@ class MeanShiftHandTracker(CpuModule):
         window: side of the window. mask_radius: of the other hand's predicted area; 0 masks nothing.
         acceleration: deviation of the Kalman filter's process, per frame squared.
         spread: deviation of a found centre, in deviations of the likelihood in the window.
-        skin: by default `SkinModel`. prior: search for lost hands wherever this density is high,
-            weighted by it, instead of in the initialisation areas.
+        skin: by default `SkinModel`. prior: over poses, or of hands given the face; search for lost hands
+            wherever its density is high, weighted by it, instead of in the initialisation areas.
 
     All lengths are in sizes of the face. The frame is scaled down for every person such that the face
     has about 19 pixels; persons of one scale are one batch. Two things depend on the other persons:
@@ -119,7 +120,7 @@ class MeanShiftHandTracker(CpuModule):
         acceleration: float = 0.12,
         spread: float = 0.65,
         skin: SkinModel | None = None,
-        prior: HandPrior | None = None,
+        prior: UpperBodyPrior | HandPrior | None = None,
     ) -> None:
         super().__init__()
         if likelihood not in _THRESHOLDS:
@@ -139,7 +140,7 @@ class MeanShiftHandTracker(CpuModule):
         self.window, self.mask_radius = window, mask_radius
         self.acceleration, self.spread = acceleration, spread
         self.skin = SkinModel() if skin is None else skin
-        self.prior = prior
+        self.prior = None if prior is None else HandPrior.from_prior(prior)
         eye = torch.eye(2, dtype=torch.float32)
         self.register_buffer("matrix", torch.kron(eye.new_tensor([[1.0, 1.0], [0.0, 1.0]]), eye))
         drive = torch.cat([0.5 * eye, eye])  # a constant acceleration within a frame

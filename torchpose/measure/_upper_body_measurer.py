@@ -19,7 +19,6 @@ from torchpose.measure._face_detector import FaceDetector, scaled_back
 from torchpose.measure._grey_frame import GreyFrame, grey_scale
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
-from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._hand_windows import HandView, HandWindowState
 from torchpose.measure._hands import HandBeliefs, HandTracker
 from torchpose.measure._head import FACE_OFFSETS, WITHOUT_ELBOWS, HeadNeck
@@ -183,9 +182,7 @@ class UpperBodyMeasurer(CpuModule):
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":
             network = shipped_hand_network() if self.learnt else None
-            self.hand_tracker = HandTracker(
-                HandPrior.from_prior(prior), fps=fps, network=network, elbows=measured
-            )
+            self.hand_tracker = HandTracker(prior, fps=fps, network=network, elbows=measured)
         else:
             self.hand_tracker = MeanShiftHandTracker()
         self.background = BackgroundModel() if background else None
