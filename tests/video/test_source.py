@@ -33,6 +33,16 @@ def in_folder(tmp_path, monkeypatch):
     return tmp_path, opened
 
 
+def test_a_number_is_a_camera(in_folder):
+    folder, opened = in_folder
+    (folder / "3").mkdir()
+    open_video(3, fps=60)
+    assert opened == [(3, 60)]
+    for wrong in (-1, True, None, b"clip.mp4"):
+        with pytest.raises(InputError, match="number"):
+            open_video(wrong)
+
+
 def test_digits_are_a_camera_only_without_such_a_path(in_folder):
     folder, opened = in_folder
     open_video("0")

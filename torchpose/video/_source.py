@@ -13,13 +13,13 @@ _KINDS = ("file", "folder", "camera")
 
 
 def open_video(
-    where: str | Path, *, kind: str | None = None, fps: float | None = None
+    where: str | Path | int, *, kind: str | None = None, fps: float | None = None
 ) -> VideoSource:
     """Open a video file, a folder of images, or a camera.
 
     Args:
-        where: path of a file or folder, or the number of a camera. Digits are a camera only if no
-            such path exists.
+        where: path of a file or folder, or the number of a camera, as text too. Digits of a text are a
+            camera only if no such path exists.
         kind: "file", "folder" or "camera", to say which; None finds out.
         fps: frames per second. A file is resampled to it, a folder is taken to have it (30 without),
             a camera is asked for it, and frames of a faster one are left out.
@@ -43,7 +43,11 @@ def open_video(
     """
     if kind not in (None, *_KINDS):
         raise InputError(f"kind must be one of {', '.join(_KINDS)} or None, got {kind!r}")
-    text, path = str(where), Path(where)
+    if isinstance(where, bool) or not isinstance(where, str | os.PathLike | int):
+        raise InputError(f"expected a path or the number of a camera, got {where!r:.60}")
+    text, path = str(where), Path(str(where))
+    if isinstance(where, int) and kind is None:
+        kind = "camera"
     digits = text.isascii() and text.isdigit()
     if kind == "camera" or (kind is None and digits and not os.path.exists(path)):
         if not digits:
