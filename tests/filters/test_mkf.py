@@ -451,6 +451,11 @@ def good_arguments():
         ({"tracks": "frozen"}, InputError, "fixed, sampled, split"),
         ({"n_tracks": 7}, InputError, "tracks='sampled' or 'split'"),
         ({"uniform_weight": -1.0}, InputError, "at least 0"),
+        (
+            {"tracks": "split", "n_tracks": 2.5},
+            InputError,
+            "n_tracks must be a whole number, got 2.5",
+        ),
         ({"tracks": "sampled", "resample_threshold": 7}, InputError, "from 0 to 1"),
         ({"tracks": "sampled", "resample_threshold": -1}, InputError, "from 0 to 1"),
         ({"burn_in": -1}, InputError, "burn_in"),
@@ -496,6 +501,7 @@ def test_bad_models_are_refused(change, error, message):
         ({"measurement_cov": -torch.eye(2)}, CovarianceError, "positive definite"),
         ({"measurement_cov": torch.eye(2).expand(1, 4, 2, 2)}, ShapeError, "measurement_cov"),
         ({"generator": [torch.Generator()] * 2}, InputError, "one for each"),
+        ({"generator": 5}, InputError, r"must be a torch\.Generator, or a list of them, got 5"),
     ],
 )
 def test_bad_calls_are_refused(call, error, message):

@@ -615,8 +615,11 @@ def test_bad_covariances_and_batches_are_refused():
             prior, torch.ones(2), torch.ones(1), [0], initial_cov=torch.eye(2).expand(5, 2, 2)
         )
     tracker = BootstrapParticleFilter(prior, torch.ones(2), torch.ones(1), [0], n_particles=10)
-    with pytest.raises(InputError, match="batch_size"):
-        tracker.init(0)
+    for size in (0, 1.5, True):
+        with pytest.raises(InputError, match="batch_size must be"):
+            tracker.init(size)
+    with pytest.raises(InputError, match=r"torch\.Generator\(\)\.manual_seed"):
+        tracker.init(1, generator=0)
 
 
 @pytest.mark.cuda

@@ -383,6 +383,10 @@ def test_a_prior_of_another_kind_is_refused(prior):
         ({"confidence": torch.full((1, 10, 4), 7.0)}, InputError, r"\[0, 1\]"),
         ({"confidence": torch.full((1, 10, 4), -0.1)}, InputError, r"\[0, 1\]"),
         ({"mask": torch.ones(1, 9, 4, dtype=torch.bool)}, ShapeError, "mask"),
+        ({"mask": torch.full((1, 10, 4), 0.1)}, InputError, r"mask must be bool .* torch\.float32"),
+        ({"absent": torch.full((1, 10, 4), math.inf)}, InputError, "probabilities from 0 to 1"),
+        ({"generator": 5}, InputError, r"torch\.Generator, or a list of them, got 5"),
+        ({"generator": [torch.Generator()] * 2}, InputError, "must hold 1, one for each"),
     ],
 )
 def test_bad_keypoints_are_refused(prior, change, error, message):

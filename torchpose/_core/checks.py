@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -220,7 +220,9 @@ def check_height(height: float, name: str = "height") -> float:
 
 
 def check_count(name: str, value: int) -> None:
-    """Raise `InputError` unless a number of things is at least 1."""
+    """Raise `InputError` unless a number of things is a whole one of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise InputError(f"{name} must be a whole number, got {value!r:.60}")
     if value < 1:
         raise InputError(f"{name} must be at least 1, got {value}")
 

@@ -191,8 +191,8 @@ class MixtureKalmanFilter(RecursiveFilter):
         """Register what filters of every kind have; the first call of their constructors."""
         RecursiveFilter.__init__(self, measurement_cov, observed, gmm.dim, dtype)
         check_transition_options(transition, gamma, subspace, burn_in, burn_in_scale)
-        if n_tracks is not None and n_tracks < 1:
-            raise InputError(f"n_tracks must be at least 1, got {n_tracks}")
+        if n_tracks is not None:
+            check_count("n_tracks", n_tracks)
         self.n_tracks = n_tracks or gmm.n_components
         self.transition_kind, self.subspace = transition, subspace
         self.burn_in = burn_in

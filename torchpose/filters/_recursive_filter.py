@@ -47,7 +47,11 @@ def standard_normal(
 
     Returns:
         [B, *shape], of the dtype and on the device of `like`.
+
+    Raises:
+        InputError: neither a generator nor a list of B of them.
     """
+    check_generators(generator, batch)
     kind = {"dtype": like.dtype, "device": like.device}
     if isinstance(generator, torch.Generator) or generator is None:
         return torch.randn(batch, *shape, generator=generator, **kind)
@@ -65,7 +69,11 @@ def uniform(
 
     Returns:
         [B, *shape], of the dtype and on the device of `like`.
+
+    Raises:
+        InputError: neither a generator nor a list of B of them.
     """
+    check_generators(generator, batch)
     kind = {"dtype": like.dtype, "device": like.device}
     if isinstance(generator, torch.Generator) or generator is None:
         return torch.rand(batch, *shape, generator=generator, **kind)
@@ -73,10 +81,20 @@ def uniform(
 
 
 def check_generators(generator: Generators, batch: int) -> None:
-    """Raise `InputError` for a list that does not hold one generator for each sequence."""
-    if isinstance(generator, Sequence) and len(generator) != batch:
+    """Raise `InputError` for what is no generator, and a list that does not hold one for each sequence."""
+    if generator is None:
+        return
+    several = isinstance(generator, Sequence)
+    each: Sequence[Any] = generator if isinstance(generator, Sequence) else [generator]
+    for one in each:
+        if not isinstance(one, torch.Generator):
+            raise InputError(
+                f"generator must be a torch.Generator, or a list of them, got {one!r:.60}; "
+                "torch.Generator().manual_seed(0) makes one of a seed"
+            )
+    if several and len(each) != batch:
         raise InputError(
-            f"a list of generators must hold {batch}, one for each sequence, got {len(generator)}"
+            f"a list of generators must hold {batch}, one for each sequence, got {len(each)}"
         )
 
 

@@ -65,7 +65,7 @@ def absence_of(
             "absent needs the borders of the image: expected a camera with width and height, got one "
             "without; leave absent out, or give the camera its size"
         )
-    known = absent.isfinite()
+    known = ~absent.isnan()
     if bool((known & ((absent < 0) | (absent > 1))).any()):
         raise InputError(
             "absent must hold probabilities from 0 to 1, or NaN where nothing is known"

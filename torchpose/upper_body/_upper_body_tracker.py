@@ -31,7 +31,7 @@ from torchpose.camera._lens import is_distorted
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._tilt import angles_of_up
 from torchpose.errors import InputError
-from torchpose.filters._recursive_filter import Generators
+from torchpose.filters._recursive_filter import Generators, check_generators
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import NECK_KINDS
@@ -308,6 +308,7 @@ class UpperBodyTracker(WideModule):
         with one_run(cov.device):
             check_tensors(keypoints=keypoints)
             keypoints = check_sequences(keypoints).to(cov)
+            check_generators(generator, len(keypoints))
             picked = self._pick(keypoints.shape[2], names)
             if lengths is not None:
                 lengths = as_lengths(lengths, *keypoints.shape[:2])
@@ -362,6 +363,7 @@ class UpperBodyTracker(WideModule):
                 f"{self.smoothing!r}"
             )
         check_count("batch_size", batch_size)
+        check_generators(generator, batch_size)
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
         cov = self.measurement_cov
@@ -498,6 +500,10 @@ class UpperBodyTracker(WideModule):
         measurement_cov: Float[Tensor, "8 2 2"],
     ) -> MeasuredJoints:
         check_tensors(confidence=confidence, mask=mask, covariance=covariance, absent=absent)
+        if mask is not None and mask.dtype != torch.bool:
+            raise InputError(
+                f"mask must be bool (True = measured), got {mask.dtype}; `confidence` says how sure"
+            )
         measured = in_prior_pixels(
             keypoints, confidence, mask, covariance, picked, self.prior, self.camera,
             measurement_cov,
