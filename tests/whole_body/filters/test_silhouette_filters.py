@@ -591,6 +591,8 @@ def test_options_that_the_annealed_filter_refuses(options, message):
 def test_inputs_that_are_refused():
     body, masks = LinearBody(3), torch.ones(4, 2, 5, 6, dtype=torch.bool)
     tracker = SIRParticleFilter(body, 5)
+    with pytest.raises(InputError, match="precision of SIRParticleFilter"):
+        tracker.half()
     with pytest.raises(ShapeError, match="initial_state"):
         tracker(masks, None, torch.zeros(4))
     with pytest.raises(ShapeError, match="initial_state must be"):

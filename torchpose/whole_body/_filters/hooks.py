@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
+from torchpose._core.module_state import NoHalfModule
 from torchpose.filters._recursive_filter import Generators
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (
@@ -27,7 +28,7 @@ _DIED = (
 )
 
 
-class BodyFilterHooks(nn.Module, ABC):
+class BodyFilterHooks(NoHalfModule, ABC):
     """Defines what `SilhouetteParticleFilter` and `BodyTracker` ask of a filter.
 
     Attributes:
