@@ -15,6 +15,7 @@ from torchpose.errors import (
     FileFormatError,
     InputError,
     NobodySeenError,
+    ShapeError,
     SkeletonError,
 )
 from torchpose.io import Keypoints, read_keypoints, write_keypoints
@@ -220,6 +221,22 @@ def test_writing_keeps_the_camera(tmp_path):
     assert back.neck == "neck"
     with pytest.raises(InputError, match=r"\.npz or \.csv"):
         write_keypoints(tmp_path / "a.json", data)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv"])
+def test_what_could_not_be_read_is_not_written(tmp_path, suffix):
+    path, good = tmp_path / f"a{suffix}", torch.from_numpy(points())
+    write_keypoints(path, Keypoints(good.clone().requires_grad_(), NAMES))
+    before = path.read_bytes()
+    for data, word in (
+        (Keypoints(good[None], NAMES), r"keypoints must have shape \[T, 3, 2\]"),
+        (Keypoints(good, NAMES[:2]), r"keypoints must have shape \[T, 2, 2\]"),
+        (Keypoints(good, NAMES, torch.ones(5)), r"confidence must have shape \[5, 3\]"),
+    ):
+        with pytest.raises(ShapeError, match=word):
+            write_keypoints(path, data)
+    assert path.read_bytes() == before
+    torch.testing.assert_close(read_keypoints(path).keypoints, good)
 
 
 def test_wide_rows(tmp_path):

@@ -15,7 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import CONFIDENCE_ADVICE, MOST_CONFIDENCE, check_pixels
+from torchpose._core.checks import (
+    CONFIDENCE_ADVICE,
+    MOST_CONFIDENCE,
+    check_pixels,
+    check_shape,
+    check_tensors,
+)
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose._core.wording import counted
@@ -178,10 +184,16 @@ def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
         keypoints: the keypoints of one person.
 
     Raises:
-        InputError: another suffix. OutputError: the file cannot be written.
+        InputError: another suffix, or arrays in place of tensors. ShapeError: other than a point, and a
+            confidence, for each name. OutputError: the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    points, confidence = keypoints.keypoints, keypoints.confidence
+    check_tensors(keypoints=points, confidence=confidence, K=keypoints.K)
+    check_shape("keypoints", points, ["T", len(keypoints.names), 2])
+    if confidence is not None:
+        check_shape("confidence", confidence, list(points.shape[:2]))
     if suffix == ".npz":
         _write_npz(path, keypoints)
     elif suffix == ".csv":
@@ -192,10 +204,10 @@ def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
 
 
 def _write_npz(path: Path, data: Keypoints) -> None:
-    arrays = {"keypoints": data.keypoints.cpu().numpy(), "names": np.array(data.names)}
+    arrays = {"keypoints": data.keypoints.numpy(force=True), "names": np.array(data.names)}
     for key, value in (("confidence", data.confidence), ("K", data.K)):
         if value is not None:
-            arrays[key] = value.cpu().numpy()
+            arrays[key] = value.numpy(force=True)
     for key in ("fps", "image_size", "neck"):
         if getattr(data, key) is not None:
             arrays[key] = np.asarray(getattr(data, key))
