@@ -51,8 +51,9 @@ def test_select_and_len():
     assert torch.equal(rig.select([-1]).matrix[0], rig.matrix[2])
     with pytest.raises(CameraError, match="0 to 2"):
         rig.select([3])
-    with pytest.raises(CameraError, match="0 to 2"):
-        rig.select([])
+    for wrong in ([], [True, False, True], torch.tensor([True, False, True])):
+        with pytest.raises(CameraError, match="0 to 2"):
+            rig.select(wrong)
     assert some.double().state_dict().keys() == rig.state_dict().keys()
 
 

@@ -237,6 +237,17 @@ def test_epsilon_lets_a_component_come_back():
     assert lost.log_weights[0, -1].exp()[1] < 1e-6
 
 
+def test_transitions_take_one_rate_and_no_variances():
+    _, means, covs = map(tensor, random_mixture(np.random.default_rng(2), 3, DIM))
+    one, each = (
+        make_transition("ou", means, covs, torch.eye(DIM).double(), gamma)
+        for gamma in (0.9, torch.full((3,), 0.9).double())
+    )
+    torch.testing.assert_close(one, each)
+    with pytest.raises(ShapeError, match=r"process_cov must have shape \[4, 4\], got \[4\]"):
+        make_transition("paper", means, covs, torch.ones(DIM).double())
+
+
 @pytest.mark.parametrize("kind", ["paper", "stationary", "ou", "subspace"])
 def test_transitions_settle_where_they_say(kind):
     rng = np.random.default_rng(2)

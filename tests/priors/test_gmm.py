@@ -237,6 +237,11 @@ def test_bad_arguments_are_refused():
         mixture.log_prob(torch.zeros(4))
     with pytest.raises(InputError, match="distinct"):
         mixture.marginal([0, 0])
+    for wrong in ([0.5], [True, False], torch.tensor([True, False, True])):
+        with pytest.raises(InputError, match="indices must be whole numbers"):
+            mixture.marginal(wrong)
+    with pytest.raises(InputError, match="n_components must be a whole number"):
+        GaussianMixture.fit(torch.randn(20, 3), 2.5)
     with pytest.raises(InputError, match=r"0\.\.2"):
         mixture.condition([3], torch.zeros(1))
     with pytest.raises(ShapeError):

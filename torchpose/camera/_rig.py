@@ -143,10 +143,11 @@ class CameraRig(NoHalfModule):
             Rig with as many cameras as there are indices.
 
         Raises:
-            CameraError: no index, or one that no camera has.
+            CameraError: no index, one that no camera has, or a truth value.
         """
+        truth = any(getattr(i, "dtype", type(i)) in (bool, np.bool_, torch.bool) for i in index)
         index = [int(i) for i in index]
-        if not index or not all(-len(self) <= i < len(self) for i in index):
+        if truth or not index or not all(-len(self) <= i < len(self) for i in index):
             raise CameraError(f"indices must be among 0 to {len(self) - 1}, got {index}")
         rig = copy.copy(self)
         rig._buffers = {name: b[index] for name, b in self.named_buffers()}

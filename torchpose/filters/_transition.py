@@ -80,7 +80,7 @@ def make_transition(
     means: Float[Tensor, "K D"],
     covariances: Float[Tensor, "K D D"],
     process_cov: Float[Tensor, "D D"],
-    gamma: Float[Tensor, "*K"] | None = None,
+    gamma: Float[Tensor, "*K"] | float | None = None,
     subspace: int | None = None,
 ) -> Transition:
     """Return the transition of every component.
@@ -99,18 +99,19 @@ def make_transition(
         kind: "paper", "stationary" or "ou".
         means, covariances: the means and covariances of the prior's components, [K, D] and [K, D, D].
         process_cov: Q [D, D]; not used by "ou".
-        gamma: [K] or [], in [0, 1); only for "ou".
+        gamma: [K] or one number, in [0, 1); only for "ou".
         subspace: number of principal directions, only for "ou".
 
     Returns:
         `Transition` with F [K, D, D], b [K, D] and N [K, D, D], symmetric.
 
     Raises:
-        InputError: unknown kind, or gamma missing or outside [0, 1).
+        InputError: unknown kind, or gamma missing or outside [0, 1). ShapeError: variances in place of Q.
     """
     if kind == "ou":
         return _scalar_rate(means, covariances, gamma, subspace)
     check_choice("transition", kind, TRANSITIONS)
+    check_shape("process_cov", process_cov, list(covariances.shape[-2:]))
     factor = safe_cholesky(covariances + process_cov)
     matrix = torch.cholesky_solve(covariances, factor).mT
     rest = torch.cholesky_solve(process_cov.expand_as(covariances), factor).mT
@@ -123,13 +124,14 @@ def make_transition(
 
 
 def _scalar_rate(
-    means: Tensor, covariances: Tensor, gamma: Tensor | None, subspace: int | None
+    means: Tensor, covariances: Tensor, gamma: Tensor | float | None, subspace: int | None
 ) -> Transition:
     if gamma is None:
         raise InputError(
             "transition 'ou' needs gamma, [K] or a number in [0, 1), got None; "
             "fit it with torchpose.filters.fit_gamma or pass for instance 0.95"
         )
+    gamma = torch.as_tensor(gamma).to(means)
     with torch.no_grad():
         outside = (gamma < 0) | (gamma >= 1) | ~torch.isfinite(gamma)
         if values_visible() and bool(outside.any()):

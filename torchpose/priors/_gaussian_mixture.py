@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from torchpose._core.checks import (
     check_choice,
+    check_count,
     check_covariance,
     check_finite,
     check_real,
@@ -379,7 +380,10 @@ class GaussianMixture(NoHalfModule):
         )
 
     def _indices(self, indices: Sequence[int] | Tensor) -> Tensor:
-        index = torch.as_tensor(indices, dtype=torch.long, device=self.means.device).reshape(-1)
+        given = torch.as_tensor(indices, device=self.means.device).reshape(-1)
+        if len(given) and (given.is_floating_point() or given.dtype == torch.bool):
+            raise InputError(f"indices must be whole numbers, got {given.tolist()}")
+        index = given.long()
         index = torch.where(index < 0, index + self.dim, index)
         if bool(((index < 0) | (index >= self.dim)).any()) or len(index.unique()) != len(index):
             raise InputError(
@@ -400,8 +404,7 @@ def _check_fit(
     check_shape("x", x, ("N", "D"))
     check_finite("x", x, hint="drop frames with missing joints before the fit")
     for name, value in (("n_components", n_components), ("n_init", n_init)):
-        if value < 1:
-            raise InputError(f"{name} must be at least 1, got {value}")
+        check_count(name, value)
     if len(x) < n_components:
         raise InputError(
             f"a fit needs at least as many points as components, got {len(x)} points for "
