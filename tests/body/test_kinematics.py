@@ -97,6 +97,18 @@ def test_any_leading_shape_and_dtype(dtype, lead):
 
 
 @pytest.mark.parametrize("frame", ["parent", "body"])
+def test_states_of_another_precision_keep_theirs(frame):
+    body = some_body(frame=frame)
+    states, weights = random_states(body, 5), torch.zeros(5)
+    single = states.float()
+    for measured in (body.joints, lambda x: body.limbs(x).end, lambda x: body.mean(x, weights)):
+        assert measured(single).dtype == torch.float32
+        torch.testing.assert_close(measured(single), measured(states).float(), atol=1e-5, rtol=1e-5)
+    back = body.state_of(single[:, :3], body.part_rotations(single))
+    torch.testing.assert_close(body.joints(back), body.joints(single), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("frame", ["parent", "body"])
 def test_gradients_are_right_and_finite_everywhere(frame):
     body = some_body(frame)
     state = random_states(body, 1).requires_grad_()

@@ -73,7 +73,7 @@ class Body(nn.Module):
         frame: ``"parent"`` or ``"body"``.
         tips: [K, 3], this person's offsets of the tips, metres; by default the skeleton's, scaled
             with the body height.
-        dtype: the floating-point type of buffers and states.
+        dtype: the floating-point type of buffers; joints and rotations have that of the states.
 
     Attributes:
         skeleton, frame: as given. dim: D, the numbers in a state.
@@ -194,7 +194,7 @@ class Body(nn.Module):
         Args:
             skeleton: gives the proportions. height: metres.
             frame: "parent" or "body", see `Body`.
-            dtype: the floating-point type of buffers and states.
+            dtype: the floating-point type of buffers, see `Body`.
 
         Returns:
             `Body` with the skeleton's standard lengths and radii.
@@ -268,7 +268,7 @@ class Body(nn.Module):
         turns = quaternion_vector_to_matrix(state[..., 3:].unflatten(-1, (-1, 3)))
         geometry = self._geometry()
         if geometry.centred:  # a product with unit matrices would cost a tenth
-            turns = geometry.centre_rotations @ turns
+            turns = geometry.centre_rotations.to(turns) @ turns
         if self.frame == "body":
             root, others = turns[..., :1, :, :], turns[..., 1:, :, :]
             return torch.cat([root, root @ others], -3)
@@ -320,7 +320,7 @@ class Body(nn.Module):
 
     def _points(self, state: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
         rows = rotations.transpose(-3, -2).flatten(-2)  # [..., 3, 3 P]
-        return (rows @ weights).mT + state[..., None, _ROOT]
+        return (rows @ weights.to(rows)).mT + state[..., None, _ROOT]
 
     # --- states as values ---------------------------------------------------------------------
 
@@ -386,7 +386,7 @@ class Body(nn.Module):
         highest = log_weights.amax(-1)
         if not bool((highest > -math.inf).all()):
             raise InputError("the mean needs a particle with a weight above zero, got none")
-        weights = log_weights.softmax(-1)
+        weights = log_weights.softmax(-1).to(states)
         plain = (weights[..., None, :] @ states).squeeze(-2)
         heading = mean_rotation(states[..., _HEADING], weights)
         heading = heading.expand(*plain.shape[:-1], 3)
@@ -453,7 +453,7 @@ class Body(nn.Module):
             above = rotations[..., :1, :, :]
         else:
             above = rotations[..., list(self.skeleton.part_parents[1:]), :, :]
-        turns = self.centre_rotations[1:].mT @ (above.mT @ rotations[..., 1:, :, :])
+        turns = self.centre_rotations[1:].mT.to(rotations) @ (above.mT @ rotations[..., 1:, :, :])
         vectors = matrix_to_quaternion_vector(torch.cat([rotations[..., :1, :, :], turns], -3))
         return torch.cat([position, vectors.flatten(-2)], -1)
 
