@@ -53,6 +53,11 @@ def test_the_level_world_of_a_camera_has_y_up_and_its_heading(pitch, roll):
     torch.testing.assert_close(level.rotation_matrix, torch.diag(EYE.new_tensor([1.0, -1, -1])))
 
 
+def test_a_tilted_camera_keeps_its_precision():
+    camera = PinholeCamera(525, 525, 319.5, 239.5).float()
+    assert {x.dtype for x in camera.tilted(0.2).in_level_world().buffers()} == {torch.float32}
+
+
 def test_a_camera_that_is_rolled_clockwise_sees_the_sky_on_its_left():
     assert CAMERA.tilted(0.0, math.pi / 2).up.tolist() == pytest.approx([-1, 0, 0])
     assert CAMERA.tilted(0.3).up.tolist() == pytest.approx([0, -math.cos(0.3), math.sin(0.3)])

@@ -269,7 +269,7 @@ class PinholeCamera(NoHalfModule):
             fx, fy, cx, cy, self.width, self.height, self.name, skew=skew,
             distortions=self.distortions.tolist(), rotation=self.rotation.tolist(),
             translation=self.translation.tolist(), fisheye=self.fisheye, up=up,
-        ).to(self.matrix.device)  # fmt: skip
+        ).to(self.matrix)  # fmt: skip
 
     def forward(self, points: Float[Tensor, "... J 3"]) -> Float[Tensor, "... J 3"]:
         """Project world points by K, rotation and translation (BL 3); distortions are not applied.
