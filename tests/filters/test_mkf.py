@@ -509,6 +509,7 @@ def test_bad_models_are_refused(change, error, message):
         ({"lengths": torch.tensor([0])}, InputError, "from 1 to 5"),
         ({"lengths": torch.tensor([6])}, InputError, "from 1 to 5"),
         ({"lengths": torch.tensor([1.5])}, InputError, "integers"),
+        ({"lengths": torch.tensor([2j])}, InputError, "integers"),
         ({"measurement_cov": -torch.eye(2)}, CovarianceError, "positive definite"),
         ({"measurement_cov": torch.eye(2).expand(1, 4, 2, 2)}, ShapeError, "measurement_cov"),
         ({"generator": [torch.Generator()] * 2}, InputError, "one for each"),

@@ -98,8 +98,9 @@ def check_lengths(
         return torch.full((batch,), n_frames, device=device)
     lengths = torch.as_tensor(lengths, device=device)
     check_shape("lengths", lengths, [batch])
-    found = lengths.long()  # unsigned numbers of 16 bits and more cannot be compared
     broken = lengths.dtype.is_floating_point or lengths.is_complex() or lengths.dtype == torch.bool
+    # unsigned numbers of 16 bits and more cannot be compared
+    found = torch.zeros_like(lengths, dtype=torch.long) if broken else lengths.long()
     outside = (found < 1) | (found > n_frames)
     if broken or (values_visible() and bool(outside.any())):
         raise InputError(f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}")
