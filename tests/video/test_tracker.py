@@ -331,6 +331,12 @@ def test_bad_use_is_refused(prior):
         tracker([small])
     with pytest.raises(InputError, match="30 x 20 pixels"):
         tracker.step(tracker.init(), small)
+    anywhere = VideoTracker(prior, PinholeCamera(525, 525, 320, 240))
+    with pytest.raises(InputError, match="20 x 20 pixels, and those before are of 30 x 20"):
+        anywhere([small, small[:, :20]])
+    for empty in (small[:0], torch.zeros(3, 0, 5, dtype=torch.uint8)):
+        with pytest.raises(InputError, match="a frame must be RGB"):
+            anywhere([empty])
     with pytest.raises(InputError, match=r"15\.08 frames per second, and the tracker is for 30"):
         tracker(Video([], 15.08))
     with pytest.raises(InputError, match="25 frames per second"):

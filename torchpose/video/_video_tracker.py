@@ -465,22 +465,24 @@ def as_image(image: Any) -> Image:
                 "a frame must be an RGB tensor [3, H, W] of uint8, got "
                 f"{list(image.shape)} of {image.dtype}"
             )
-        return np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
-    check_rgb("a frame", image)
+        image = np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
+    check_rgb("a frame", image, empty=False)
     return np.asarray(image)
 
 
 def _images_of_size(
     frames: Iterable[Any] | Tensor, size: tuple[int, int] | None
 ) -> Iterator[tuple[Image, int]]:
-    """Yield the images of frames, of the camera's size (width, height) if known, with the numbers missed."""
+    """Yield the images of frames with the numbers missed, all of the size of the camera, or of the first."""
+    given = "the camera is for images" if size is not None else "those before are"
     for frame in frames:
         image = as_image(getattr(frame, "image", frame))
-        own = image.shape[1::-1]
-        if size is not None and len(own) == 2 and own != size:
+        own = image.shape[1], image.shape[0]
+        size = own if size is None else size
+        if own != size:
             raise InputError(
-                f"a frame is of {own[0]} x {own[1]} pixels, and the camera is for images of "
-                f"{size[0]} x {size[1]}; give the camera of the frames"
+                f"a frame is of {own[0]} x {own[1]} pixels, and {given} of {size[0]} x {size[1]}; give the "
+                "camera of the frames, or frames of one size"
             )
         yield image, getattr(frame, "missed", 0)
 
