@@ -27,6 +27,7 @@ from torchpose.whole_body._first_pose import find_first_pose
 from torchpose.whole_body._following import Observed, all_see, follow
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
+from torchpose.whole_body._keypoints.nested import joined
 from torchpose.whole_body._measured_keypoints import (
     BodyKeypointMeasurer,
     GivenKeypoints,
@@ -169,8 +170,7 @@ class ParticleFollower:
         """
         keypoints = [one.keypoints.frame for one in frames if one.keypoints is not None]
         if keypoints:
-            joined = KeypointFrame(*(torch.cat(v) for v in zip(*keypoints, strict=True)))
-            found = self.measurer.first_pose(joined)
+            found = self.measurer.first_pose(joined(keypoints))
         else:
             prior = self.start_prior
             prior = getattr(self.filter, "manifold", None) if prior is None else prior

@@ -25,6 +25,7 @@ from torchpose.whole_body._keypoints.camera_causes import (
 from torchpose.whole_body._keypoints.coarse_delays import shifted
 from torchpose.whole_body._keypoints.faulty_cameras import without_still_frames
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.nested import joined
 
 _FRAMES = 30  # at most, that are looked at
 _LEAST_KEYPOINTS = 100  # of joints that two cameras see
@@ -151,7 +152,7 @@ def _cause_of_several(seen: _Seen) -> CameraCause | None:
     raw = [_Tried("raw", c, ()) for c in seen.cameras if bool(rig.distortions[c].any())]
     own = _repeated(some, len(tried))
     distorted = [_distorted(rig, some, one.camera).map(lambda value: value[None]) for one in raw]
-    frames = KeypointFrame(*(torch.cat(values) for values in zip(own, *distorted, strict=True)))
+    frames = joined([own, *distorted])
     tried += raw
     found = explain(rig, frames, Causes.of([one[1:] for one in tried], _device(some)))
     gains = (seen.cost - seen.costs(found)).tolist()

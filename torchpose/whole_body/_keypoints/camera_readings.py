@@ -22,6 +22,7 @@ from torchpose.whole_body._keypoints.camera_order import (
 )
 from torchpose.whole_body._keypoints.joint_triangulation import agreeing, agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.nested import joined
 
 _FEW = 0.7  # share of a camera's keypoints that agree, below which its pose may be one of another convention
 _MORE_OF_TWO = 0.3  # by how much two cameras agree better by another pose of one of them
@@ -70,8 +71,7 @@ def _best_images(
     """Return the best of the other readings of the images of one camera."""
     readings = list(_readings(rig, some, exchange))
     tried = [_one_by_one(some, other) for _, other in readings]
-    side_by_side = KeypointFrame(*(torch.cat(values, 1) for values in zip(*tried, strict=True)))
-    best, place = agreement_of_readings(maps, side_by_side).max(0)
+    best, place = agreement_of_readings(maps, joined(tried, 1)).max(0)
     return _Reading(float(best), readings[int(place) // len(rig)][0], int(place) % len(rig))
 
 

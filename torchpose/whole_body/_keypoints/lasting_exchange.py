@@ -12,6 +12,7 @@ from torch import Tensor
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, with_sides_exchanged
 from torchpose.whole_body._keypoints.keypoint_start import FEW_HEADINGS, start
+from torchpose.whole_body._keypoints.nested import joined
 
 # Values of `frames_lost`: in the second frame of exchanged sides, and every third after it.
 _FIRST, _EVERY = 1.0, 1.5
@@ -47,8 +48,7 @@ def evidence_of_own_sides(
     as_is = frame.take(places[:, 0])
     limb = torch.zeros_like(exchanged[places[:, 0]])
     limb[torch.arange(len(places), device=places.device), places[:, 1], places[:, 2]] = True
-    pairs = zip(as_is, with_sides_exchanged(as_is, limb, filter.exchange), strict=True)
-    both = KeypointFrame(*(torch.cat(pair) for pair in pairs))
+    both = joined([as_is, with_sides_exchanged(as_is, limb, filter.exchange)])
     own, other = start(filter, both, FEW_HEADINGS).log_evidence.chunk(2)
     at = tuple(places.T)
     gain = (own - other).clamp_max(_MOST_GAIN)

@@ -54,6 +54,11 @@ def stacked(frames: Sequence[Any]) -> Any:
     return mapped(lambda *values: torch.stack(values, 1), *frames)
 
 
+def joined(parts: Sequence[Any], dim: int = 0) -> Any:
+    """Return tensors, or named tuples of tensors, put one after the other along a dimension."""
+    return mapped(lambda *values: torch.cat(values, dim), *parts)
+
+
 def part_of(value: Any, rows: slice, dim: int = 1) -> Any:
     """Return the frames from the start of a slice to its stop, of tensors or of named tuples of tensors."""
     return mapped(lambda tensor: tensor.narrow(dim, rows.start, rows.stop - rows.start), value)
@@ -74,7 +79,7 @@ def by_parts(fn: Callable[..., Any], *sequences: Any, dim: int = 1) -> Any:
     end = _n_frames(sequences, dim)
     parts = [slice(begin, min(begin + PART, end)) for begin in range(0, end, PART)]
     found = [fn(*part_of(sequences, rows, dim)) for rows in parts]
-    return found[0] if len(found) == 1 else mapped(lambda *values: torch.cat(values, dim), *found)
+    return found[0] if len(found) == 1 else joined(found, dim)
 
 
 def _n_frames(value: Any, dim: int) -> int:

@@ -27,7 +27,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import notes_on_strays
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import to_be_smoothed
-from torchpose.whole_body._keypoints.nested import FrameCollector, one_of, stacked, taken
+from torchpose.whole_body._keypoints.nested import FrameCollector, joined, one_of, stacked, taken
 from torchpose.whole_body._keypoints.people_association import (
     pairs_of_detections,
     taken_detections,
@@ -210,7 +210,7 @@ class PeopleBodyTracker:
         pairs = [
             pairs_of_detections(taken(frames, t)) for t in range(0, len(frames.pixels), stride)
         ]
-        found = KeypointFrame(*(torch.cat(values) for values in zip(*pairs, strict=True)))
+        found: KeypointFrame = joined(pairs)
         agreed = triangulate(filter.maps, found).isfinite().all(-1).sum(-1)
         both = ((found.inlier > 0).sum(1) >= 2).sum(-1)
         rows = (agreed > _AGREED * both).nonzero().squeeze(-1)

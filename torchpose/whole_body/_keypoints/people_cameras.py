@@ -25,7 +25,7 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
-from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.nested import joined, mapped, taken
 from torchpose.whole_body._keypoints.people_association import LEAST_JOINTS, owned_detections
 from torchpose.whole_body._keypoints.people_turns import turns_of_all
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, side_by_side
@@ -111,4 +111,4 @@ def _of_witnesses(frame: KeypointFrame) -> KeypointFrame:
     some = frame.take(rows)
     none = frame.map(lambda value: value.new_ones(_WITNESSES - len(rows), *value.shape[1:]))
     none = none._replace(inlier=torch.zeros_like(none.inlier))
-    return side_by_side(mapped(lambda *both: torch.cat(both)[None], some, none))
+    return side_by_side(joined([some, none]).map(lambda value: value[None]))
