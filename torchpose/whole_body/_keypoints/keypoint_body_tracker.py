@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
@@ -59,11 +59,10 @@ from torchpose.whole_body._keypoints.known_person import (
     with_height,
 )
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
-from torchpose.whole_body._keypoints.nested import mapped, part_of
+from torchpose.whole_body._keypoints.nested import part_of, taken
 from torchpose.whole_body._keypoints.track_builder import TrackBuilder, without_poses
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
-T = TypeVar("T")
 SMOOTHING = ("none", "full")
 PIXEL_STD = 1.0
 """Pixels, how far keypoints are from projected joints, beside what they are off in space."""
@@ -195,9 +194,9 @@ class KeypointBodyTracker(nn.Module):
         found = self.feet_of(poses, feet, smoothing == "full")
         tracks = []
         for b, end in enumerate(ends.tolist()):
-            own, seen = part_of((poses, frames), slice(0, end))
-            standing = None if found is None else part_of(found, slice(0, end))
-            track = self.builder.track(own, seen, b, cameras=b == 0, feet=standing)
+            own, seen = part_of(taken((poses, frames), b), slice(0, end), 0)
+            standing = None if found is None else part_of(taken(found, b), slice(0, end), 0)
+            track = self.builder.track(own, seen, cameras=b == 0, feet=standing)
             track.notes += late_note(track.first_frame, TOO_FEW)
             tracks.append(repeat_last(track, n_frames - end))
         return tracks[0] if single else tracks
@@ -225,12 +224,8 @@ class KeypointBodyTracker(nn.Module):
         if feet is not None:
             feet = feet.map(lambda value: value[None])
             standing, found = step_feet(self.feet, standing, self.tracker.filter.maps, pose, feet)
-            found = with_time(found)
-        frames = frame.map(lambda value: value[:, None])
-        track = self.builder.track(
-            with_time(pose), frames, 0, summed_up=False, feet=found, followed=followed
-        )
-        faults = mapped(lambda value: value[0], body.faults)
+        track = self.builder.track(pose, frame, summed_up=False, feet=found, followed=followed)
+        faults = taken(body.faults, 0)
         track.notes = notes_on_cameras_now(
             self.rig.names, faults.still, faults.off, angles_of(faults.turn)
         )
@@ -320,11 +315,11 @@ class KeypointBodyTracker(nn.Module):
             self.rig, single, track, self.fps, refine, former.exchange, smoothing, turn
         )
         found = found._replace(poses=found.poses._replace(off=off))
-        moved = found.frames.map(lambda value: value[None])
         standing = self._refined_feet(feet, found, smoothing)
         result = self.builder.track(
-            found.poses, moved, 0, refined=found, first_frame=first_frame, feet=standing
-        )
+            taken(found.poses, 0), found.frames, refined=found, first_frame=first_frame,
+            feet=None if standing is None else taken(standing, 0),
+        )  # fmt: skip
         late = late_note(result.first_frame, TOO_FEW)
         given = frames.map(lambda value: value[0])
         still = notes_on_still_cameras(self.rig.names, given.pixels, given.inlier > 0, first_frame)
@@ -402,9 +397,3 @@ def _check_camera_height(height: float | None, rig: CameraRig, up: str | None) -
             'give up as well, "y" or "z", the axis of the cameras\' world that points up (without a file of '
             "the camera, --tilt or --up y)"
         )
-
-
-def with_time(poses: T) -> T:
-    """Return what there is of one frame [B, ...] as of a sequence of one [B, 1, ...]."""
-    one: T = mapped(lambda value: value[:, None], poses)
-    return one

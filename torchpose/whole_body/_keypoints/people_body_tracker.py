@@ -18,11 +18,7 @@ from torchpose.whole_body._keypoints.camera_units import check_units
 from torchpose.whole_body._keypoints.foot_filter import FootGaussian, FootPoses
 from torchpose.whole_body._keypoints.foot_tracker import continued, step_feet
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
-from torchpose.whole_body._keypoints.keypoint_body_tracker import (
-    SMOOTHING,
-    KeypointBodyTracker,
-    with_time,
-)
+from torchpose.whole_body._keypoints.keypoint_body_tracker import SMOOTHING, KeypointBodyTracker
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import notes_on_strays
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
@@ -143,7 +139,7 @@ class PeopleBodyTracker:
         former = set() if stream is None or stream.numbers is None else set(stream.numbers.tolist())
         tracks = []
         for row in (found.identity > 0).nonzero().flatten().tolist():
-            own = None if feet is None else with_time(one_of(feet, row))
+            own = None if feet is None else one_of(feet, row)
             who = int(found.identity[row])
             followed = int(found.number[row]) in former
             one = [_Row(0, row, found)]
@@ -233,7 +229,8 @@ class PeopleBodyTracker:
                 for row in rows
             ]
             standing = self.single.feet_of(poses, stacked(seen), smoothing)
-        return self._track_of(rows, person, standing, poses)
+            standing = taken(standing, 0)
+        return self._track_of(rows, person, standing, taken(poses, 0))
 
     def _track_of(
         self,
@@ -246,14 +243,12 @@ class PeopleBodyTracker:
     ) -> BodyTrack:
         """Return the track of one person; by default of the poses as they were filtered."""
         if poses is None:
-            poses = stacked([one_of(row.frame.poses, row.row) for row in rows])
-        keypoints: KeypointFrame = stacked([one_of(row.frame.keypoints, row.row) for row in rows])
+            poses = joined([one_of(row.frame.poses, row.row) for row in rows])
+        keypoints: KeypointFrame = joined([one_of(row.frame.keypoints, row.row) for row in rows])
         track = self.single.builder.track(
-            poses, keypoints, 0, summed_up, first_frame=rows[0].time, feet=feet, followed=followed
+            poses, keypoints, summed_up, first_frame=rows[0].time, feet=feet, followed=followed
         )
-        track.details["detection"] = torch.cat(
-            [one_of(row.frame.detection, row.row) for row in rows]
-        )
+        track.details["detection"] = joined([one_of(x.frame.detection, x.row) for x in rows])
         track.details["person"] = track.details["detection"].new_full((len(rows),), person)
         return track
 

@@ -70,7 +70,6 @@ class TrackBuilder:
         self,
         poses: KeypointPoses,
         frames: KeypointFrame,
-        b: int,
         summed_up: bool = True,
         cameras: bool = True,
         refined: RefinedCameras | None = None,
@@ -78,22 +77,22 @@ class TrackBuilder:
         feet: FootPoses | None = None,
         followed: bool = False,
     ) -> BodyTrack:
-        """Return the track of one element of the batch, from the frame on in which it begins.
+        """Return the track of one person, from the frame on in which it begins.
 
         Args:
-            poses, frames: [B, T, ...], of T frames, or of one that a live stream got. b: the element.
+            poses, frames: [T, ...], of T frames, or of one that a live stream got.
             summed_up: whether notes sum the recording up. cameras: whether they name cameras.
             refined: the cameras, if they were refined. first_frame: number of the first of these frames.
             feet: of the poses. followed: whether a live stream had found the person before this frame.
         """
-        live = poses.started.shape[1] == 1
-        begun = 0 if live else int(poses.started[b].int().argmax())
-        poses, frame = mapped(lambda value: value[b, begun:], (poses, frames))
+        live = len(poses.started) == 1
+        begun = 0 if live else int(poses.started.int().argmax())
+        poses, frame = mapped(lambda value: value[begun:], (poses, frames))
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
         if feet is not None:
-            feet = mapped(lambda value: value[b, begun:], feet)
+            feet = mapped(lambda value: value[begun:], feet)
         rigid = _rigid_body(bones, ~poses.coasting)
         state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
         notes: tuple[str, ...] = ()
