@@ -14,7 +14,7 @@ _AWAY = 0.5  # share of a lost frame that one without anybody counts: a second u
 
 
 def sees_enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:
-    """Return which cameras see enough joints of a person for a start by themselves."""
+    """Return which cameras see enough joints of a person to tell by themselves where it is."""
     return (frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS
 
 

@@ -43,6 +43,7 @@ from torchpose.whole_body._keypoints.information_step import (
 )
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    LEAST_ODDS,
     NOISE_SCALES,
     Beliefs,
     Exchange,
@@ -75,7 +76,6 @@ _CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which n
 _HELD_TRUNK = 20.0  # shares of the information about the lean of its trunk that such a body gets
 _HELD_PELVIS = 2.0  # shares of that about the lean of its pelvis
 _NO_DOUBT = -12.0
-_ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 # Factors of the noise where a joint has jumped.
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
@@ -375,7 +375,7 @@ class BodyKalmanFilter(nn.Module):
         joints = triangulate(self.maps, sided)
         seen = jumped[rows] & joints.isfinite().all(-1)
         mean = self.articulation.swung(wide.mean, joints.nan_to_num(), seen)
-        log_odds = torch.logit(exchanged, _ODDS)
+        log_odds = torch.logit(exchanged, LEAST_ODDS)
         cov = wide.cov + torch.diag_embed(widened)
         wide = wide._replace(mean=mean, cov=cov, log_odds=log_odds)
         again = self._iterated(wide, readings_of(frame, self.exchange), _RECOVERY)
@@ -471,7 +471,7 @@ class BodyKalmanFilter(nn.Module):
         after = BodyGaussian(
             a.swung(point, joints),
             (cov + cov.mT) / 2.0,
-            torch.logit(weighed.exchanged, _ODDS),
+            torch.logit(weighed.exchanged, LEAST_ODDS),
             scale,
             state.doubt,
             told,
@@ -523,7 +523,7 @@ class BodyKalmanFilter(nn.Module):
             least = FEW_INLIERS * readings.inlier[0].sum(-1)
             few = (weighed.inlier.sum(-1) < least).any(-1, keepdim=True)
             if bool(few.any()):
-                beliefs = Beliefs(torch.logit(weighed.exchanged, _ODDS), state.scale)
+                beliefs = Beliefs(torch.logit(weighed.exchanged, LEAST_ODDS), state.scale)
                 wider = self._by_wider(readings, seen, beliefs, joint_cov)
                 sums, count = (
                     torch.where(few, wide, own)
@@ -641,7 +641,7 @@ class BodyKalmanFilter(nn.Module):
         off = torch.where(before[..., None], place - state.agreed, 0.0)
         near = _AGAIN**2 * unit(3, W).expand_as(W)
         odds = state.doubt.sigmoid()
-        stayed = (1 - self.transition.lost / odds).clamp_min(_ODDS).log()
+        stayed = (1 - self.transition.lost / odds).clamp_min(LEAST_ODDS).log()
         return (stayed + _log_fit(off, near, W)).masked_fill(~before, -math.inf)
 
 

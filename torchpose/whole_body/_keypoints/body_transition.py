@@ -10,13 +10,13 @@ from torch import Tensor
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._motion_drift import drift_at
+from torchpose.whole_body._keypoints.keypoint_likelihood import LEAST_ODDS
 
 _SCALE_DRIFT = 0.002  # of the log of a bone's length, per root of a second
 _EXCHANGES = 0.1  # rate, per second and camera, at which sides begin to be exchanged
 _RETURNS = 3.0  # rate, per second, at which exchanged sides become right again
 _LOST = 0.2  # rate, per second, at which a joint comes to be elsewhere than predicted
 _STAYS_LOST = 0.6  # share of such joints that a frame does not find again
-_ODDS = 1e-6  # least probability
 _JUMPS = {"position": 0.1, "rotations": 0.7, "velocity": 5.0, "shifts": 0.05}
 _ROOT_JUMP = 1.0  # metres per second
 _KEPT = 0.1  # 1/s, decay of the root's horizontal velocity while nothing is measured
@@ -76,11 +76,11 @@ class BodyTransition(NamedTuple):
     def next_log_odds(self, log_odds: Float[Tensor, "*batch C 2"]) -> Float[Tensor, "*batch C 2"]:
         """Return the log-odds of exchanged sides one frame later."""
         p = log_odds.sigmoid()
-        return torch.logit(p * (1 - self.end) + (1 - p) * self.begin, _ODDS)
+        return torch.logit(p * (1 - self.end) + (1 - p) * self.begin, LEAST_ODDS)
 
     def next_doubt(self, doubt: Float[Tensor, "*batch J"]) -> Float[Tensor, "*batch J"]:
         """Return the log-odds of joints elsewhere than predicted one frame later."""
-        return torch.logit(_STAYS_LOST * doubt.sigmoid() + self.lost, _ODDS)
+        return torch.logit(_STAYS_LOST * doubt.sigmoid() + self.lost, LEAST_ODDS)
 
 
 def transition(

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.whole_body._keypoints.begin_anew import LEAST_JOINTS, sees_enough
 from torchpose.whole_body._keypoints.body_kalman import (
     FEW_INLIERS,
     BodyKalmanFilter,
@@ -40,7 +41,6 @@ from torchpose.whole_body._keypoints.turned_cameras import (
 )
 
 LEAST_CAMERAS = 3
-LEAST_JOINTS = 6  # of a camera, that tell whether it sees the body, or stands still
 LEAST_GAIN = 10.0  # log-evidence by which an explanation must be better than right cameras
 _PATIENCE = (
     0.5  # seconds for which a camera sees something else before an explanation is looked for
@@ -180,7 +180,7 @@ def find_faults(
     found = start(filter, right, FEW_HEADINGS)
     evidence = found.log_evidence - _of_nobody(given, off, filter.maps) - tried.price.flatten()
     wrong = any_wrong(off, turn)
-    refused = _enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
+    refused = sees_enough(right) & _few_or_wide(found, right) | (angles_of(turn) > _FARTHEST_TURN)
     evidence = torch.where(refused.any(-1) & wrong, -math.inf, evidence).view(-1, n)
     best = every * n + evidence.argmax(-1)
     better = evidence.amax(-1) > least + LEAST_GAIN
@@ -240,7 +240,7 @@ def looked_at_again(
     """
     if not bool((faults.looks.n_frames > 0.0).any()):
         return faults
-    enough = _enough(frame).sum(-1) >= LEAST_CAMERAS
+    enough = sees_enough(frame).sum(-1) >= LEAST_CAMERAS
     looks, rows, best = looked_again(faults.looks, frame, enough, filter.maps, filter.fps)
     turn = faults.turn.index_copy(0, rows, best)
     wrong = any_wrong(faults.off, turn)
@@ -268,7 +268,7 @@ def watched(
     also = started if astray is None else started | astray
     if not bool((doubtful | also[:, None] | (faults.doubted != 0.0)[:, None]).any()):
         return faults, also
-    enough = _enough(frame)
+    enough = sees_enough(frame)
     doubtful = doubtful | (started[:, None] & (_noise(filter, found, frame) > _WIDE))
     doubtful = (doubtful & enough).any(-1) & begun & (enough.sum(-1) >= LEAST_CAMERAS)
     doubtful = doubtful if astray is None else doubtful | astray
@@ -293,16 +293,11 @@ def with_returned(
         readings_of(frame, filter.exchange), see(filter.maps, found.joints), filter.maps, beliefs,
         filter.exchange, found.joint_cov,
     )  # fmt: skip
-    sees = _enough(frame) & (weighed.inlier.sum(-1) >= FEW_INLIERS * frame.inlier.sum(-1))
+    sees = sees_enough(frame) & (weighed.inlier.sum(-1) >= FEW_INLIERS * frame.inlier.sum(-1))
     back = torch.where(faults.off & sees, faults.back + 1, 0.0)
     off = faults.off & (back <= _RETURN * filter.fps)
     wrong = any_wrong(off, faults.turn)
     return faults._replace(off=off, back=back, wrong=wrong)
-
-
-def _enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:
-    """Return which cameras see so much of a person that they tell whether it is the body."""
-    return (frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS
 
 
 def _few_or_wide(found: CorrectedBody, frame: KeypointFrame) -> Bool[Tensor, "B C"]:

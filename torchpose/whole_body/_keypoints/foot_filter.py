@@ -35,6 +35,7 @@ from torchpose.whole_body._keypoints.foot_motion import (
 )
 from torchpose.whole_body._keypoints.information_step import information_step
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    LEAST_ODDS,
     Beliefs,
     Exchange,
     KeypointFrame,
@@ -47,7 +48,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 
 _FOLLOWS = 0.5  # share of a change of what legs let expect that feet go along with at once
-_ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
 _KNEES = tuple(BODY_15.parents[ankle] for ankle in ANKLES)
 _SHANKS = tuple(BODY_15.part_of[ankle] for ankle in ANKLES)
 
@@ -257,7 +257,7 @@ def exchanged_legs(
     exchanged: Float[Tensor, "*batch C 2"], scale: Float[Tensor, "*batch C"]
 ) -> Beliefs:
     """Return what the tracked body tells of cameras: log-odds of exchanged legs, and the noise."""
-    return Beliefs(torch.logit(exchanged[..., 1:], _ODDS), scale)
+    return Beliefs(torch.logit(exchanged[..., 1:], LEAST_ODDS), scale)
 
 
 def _carries(part: int, limb: int) -> bool:

@@ -25,6 +25,7 @@ from torchpose.camera._rig import CameraRig
 
 NOISE_SCALES = (0.3, 20.0)  # least and largest factor of a camera's noise
 LEAST_DEPTH = 0.05  # metres in front of a camera; nearer points are not seen by it
+LEAST_ODDS = 1e-6  # least probability whose log-odds are kept, and of the opposite
 _LEAST = 1e-30  # probability
 _LEGS = ("hip", "knee", "ankle")
 

@@ -21,6 +21,7 @@ from torchpose._core.assignment import best_columns
 from torchpose.body._articulation import covariances_of
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
+from torchpose.whole_body._keypoints.begin_anew import LEAST_JOINTS, sees_enough
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
@@ -35,7 +36,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 
 _TRUNK = [BODY_15.joint(name) for name in ("pelvis", "neck", "left_hip", "right_hip")]
 _REACH = 11.3  # squared standard deviations within which 99 % of places in the room are
-LEAST_JOINTS = 6  # of a detection, and on which cameras agree, with which a person begins
 _BODY_SIZE = 0.25  # metres, standard deviation of keypoints of somebody else about a joint
 _FARTHER = 2.0  # standard deviations of a prediction, within which somebody else is
 _AGREE = 0.5  # share of the joints of two detections that must be triangulated
@@ -176,7 +176,7 @@ def group_detections(
     Args:
         maps: the cameras. frame: [D, C, J]. free: which detections are to be grouped.
     """
-    free = free & ((frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS).mT
+    free = free & sees_enough(frame).mT
     if len(maps.shift) == 1:
         return free[0].nonzero()
     pairs = _pairs(free)
@@ -201,7 +201,7 @@ def pairs_of_detections(frame: KeypointFrame) -> KeypointFrame:
     Args:
         frame: [D, C, J].
     """
-    return taken_detections(frame, _pairs(((frame.inlier > 0).sum(-1) >= LEAST_JOINTS).mT))
+    return taken_detections(frame, _pairs(sees_enough(frame).mT))
 
 
 def _pairs(free: Bool[Tensor, "C D"]) -> Int[Tensor, "H C"]:

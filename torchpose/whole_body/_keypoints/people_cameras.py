@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchpose.whole_body._keypoints.begin_anew import sees_enough
 from torchpose.whole_body._keypoints.body_kalman import CorrectedBody
 from torchpose.whole_body._keypoints.faulty_cameras import (
     LEAST_CAMERAS,
@@ -26,7 +27,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
 from torchpose.whole_body._keypoints.nested import joined, mapped, taken
-from torchpose.whole_body._keypoints.people_association import LEAST_JOINTS, owned_detections
+from torchpose.whole_body._keypoints.people_association import owned_detections
 from torchpose.whole_body._keypoints.people_turns import turns_of_all
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, side_by_side
 from torchpose.whole_body._keypoints.turned_cameras import is_turned
@@ -99,8 +100,7 @@ def strays_of(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> Bool[Tensor, 
         frame: [D, C, J]; of a detection so many joints count with which a person could begin.
         chosen: the persons' detections, -1 if none.
     """
-    enough = (frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS
-    left = enough.mT & ~owned_detections(chosen, len(frame.inlier))
+    left = sees_enough(frame).mT & ~owned_detections(chosen, len(frame.inlier))
     return left.any(-1) & (chosen < 0).any(0)
 
 
