@@ -16,9 +16,7 @@ from benchmarks.speed._timing import OperationCounter, Setup, begin, number
 
 _FRAMES, _QUICK_FRAMES = 60, 8
 _BEGINS = 5  # frames that are not timed
-_COUNTED = (
-    6  # frames whose operations are counted: the lengths of bones are learnt in one of so many
-)
+_COUNTED = 6  # frames whose operations are counted: lengths of bones are learnt in one of so many
 _BARS = (
     "Bars, CPU time: constant noise 6 ms, another confidence in every frame 8 ms, 16 streams 20 ms."
 )

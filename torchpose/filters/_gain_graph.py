@@ -24,9 +24,7 @@ from torchpose.math._gaussian import kalman_gain, symmetrise
 _SETTLED = 4e-13
 _MOST_EDGES = 1024
 _SETTLING = 32  # frames until gains are constant, as a rule
-_COST_OF_STEP = (
-    4  # to make a step of the graph, beside filtering a frame of one sequence without it
-)
+_COST_OF_STEP = 4  # of making a step of the graph, in frames of one sequence without it
 
 
 class Edge(NamedTuple):

@@ -34,9 +34,7 @@ from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 LEAST_CONFIDENCE = 0.3
 """Of a keypoint, below which it counts as missing unless something else is asked for."""
 _ANYWHERE = ("head", "neck")  # may lie above the image: they follow from face and shoulders
-_BEYOND = (
-    0.95  # probability that a keypoint cannot be seen which a detector puts outside of the image
-)
+_BEYOND = 0.95  # probability that a keypoint cannot be seen which is put outside of the image
 _KNOWN_FOR = 30.0  # seconds for which somebody who has left is remembered
 _PRESENT = 1.0  # seconds for which somebody who is not detected counts as there
 _CROPPED = 0.2  # seconds without a detection after which the whole image is searched

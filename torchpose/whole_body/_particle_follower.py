@@ -241,9 +241,7 @@ def set_up_particles(
     own = METHODS[method].needs == "manifold"  # then the filter holds it
     manifold = None if own else models.get("manifold")
     notes = tuple(note for _, note in found.values() if note)
-    start_body = (
-        None if upright is tracked else upright
-    )  # so that its tensors are in the state once
+    start_body = None if upright is tracked else upright  # so that its tensors are held once
     return ParticleFollower(method, particles, rig, fps, start_body, manifold, noise, notes)
 
 

@@ -108,10 +108,8 @@ def place_from_silhouettes(
     distance = depth * rays.norm(dim=-1)
     direction = torch.nn.functional.normalize((R.mT @ rays[..., None])[..., 0], dim=-1)
     centre = -(R.mT @ t[..., None])[..., 0]
-    across = (
-        torch.eye(3).to(K) - (1 - _DEPTH_SHARE) * direction[..., None] * direction[..., None, :]
-    )
-    across = across * seen[..., None, None]
+    along = (1 - _DEPTH_SHARE) * direction[..., None] * direction[..., None, :]
+    across = (torch.eye(3).to(K) - along) * seen[..., None, None]
     target = centre + distance[..., None] * direction
     information = across.sum(1)
     total = (across @ target[..., None]).sum(1)

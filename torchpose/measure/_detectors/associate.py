@@ -11,9 +11,7 @@ from torchpose.measure._detectors.protocol import Detections
 from torchpose.measure._face import nearest_pairs
 from torchpose.skeleton._joint_sets import canonical_names
 
-_GATE = (
-    0.5  # mean distance of the keypoints in scales of the person, within which it is the same one
-)
+_GATE = 0.5  # mean distance of keypoints, in scales of the person, within which it is the same one
 _DRIFT = 0.05  # of the gate, per frame in which the person was not detected
 _WIDEST = 1.5  # gate
 _DOUBLE = 0.15  # mean distance in scales, within which two detections are of one person

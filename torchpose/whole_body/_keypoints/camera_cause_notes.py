@@ -29,9 +29,7 @@ from torchpose.whole_body._keypoints.nested import joined
 
 _FRAMES = 30  # at most, that are looked at
 _LEAST_KEYPOINTS = 100  # of joints that two cameras see
-_PROMISE = (
-    0.015  # gain of a linear step from which on explanations are tried; right cameras have 0.007
-)
+_PROMISE = 0.015  # gain of a linear step that has explanations tried; right cameras have 0.007
 _MOST_CAMERAS = 3  # that are tried, those that promise most
 # gains are log-densities for a keypoint of full trust; no error explains right cameras by 0.02 more
 _LEAST_GAINS = {"focal": 0.1, "lens": 0.03, "raw": 0.03}

@@ -214,9 +214,8 @@ def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[Convention]:
 
     Two cameras close together tell sizes poorly, so only those that the keypoints themselves speak for count.
     """
-    sides = (
-        (2 * rig.matrix[:, :2, 2] + 1).clamp_min(1).to(some.pixels)[:, None]
-    )  # as matrices have them
+    # as matrices have them
+    sides = (2 * rig.matrix[:, :2, 2] + 1).clamp_min(1).to(some.pixels)[:, None]
     used = float((some.pixels / sides).amax(-1)[some.inlier > 0].quantile(_MOST))
     for one, of in _SCALES:
         s = one / of

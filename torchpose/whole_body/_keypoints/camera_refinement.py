@@ -49,9 +49,7 @@ _DELAY_STD = 0.2  # seconds
 _BLOCK = 1.0  # seconds within which errors of a joint's keypoints go together
 _FRAMES = 2000  # at most, that are adjusted to
 _ROUNDS = 5  # of tracking and adjusting, at most
-_BEYOND = (
-    0.5  # factor of the trust in keypoints that stand for those before the first or after the last
-)
+_BEYOND = 0.5  # factor of the trust in keypoints that stand for others beyond the first or last
 _MARGIN = 20.0  # log-evidence of other keypoints in a frame
 _LEAST_GAIN = 3.0  # log-evidence from which corrected cameras are kept
 _SETTLED = 0.2  # standard deviations by which no error changes any more

@@ -42,9 +42,7 @@ from torchpose.whole_body._keypoints.turned_cameras import (
 
 LEAST_CAMERAS = 3
 LEAST_GAIN = 10.0  # log-evidence by which an explanation must be better than right cameras
-_PATIENCE = (
-    0.5  # seconds for which a camera sees something else before an explanation is looked for
-)
+_PATIENCE = 0.5  # seconds of seeing something else before an explanation is looked for
 _PAUSE = 5.0  # seconds until the next search, where none was found
 _WIDE = 2.0  # factor of the noise's variance, above which a camera may be wrong
 _FARTHEST_TURN = 0.5  # radians, of a camera that is used nevertheless

@@ -59,9 +59,8 @@ def foot_motion(prior: FootPrior, dt: float) -> FootMotion:
     matrix[velocity, turn] = -keep * rate.square() * dt
     matrix[velocity, velocity] = keep * (1 - rate * dt)
     for columns, time in ((SHAPE, _SHAPE_TIME), (ERRORS, _ERROR_TIME)):
-        matrix[columns, columns] = math.exp(-dt / time) * torch.eye(
-            columns.stop - columns.start
-        ).to(std)
+        own = torch.arange(columns.start, columns.stop)
+        matrix[own, own] = math.exp(-dt / time)
     cov = torch.zeros(2, N_FOOT, N_FOOT, dtype=std.dtype, device=std.device)
     cov[:, TURN, TURN] = std.square().diag()
     cov[:, RATE, RATE] = (std * rate).square().diag()

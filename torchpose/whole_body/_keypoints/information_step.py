@@ -6,9 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_JITTER = (
-    1e-9  # share of a joint's information that is added along every axis, so that it has a factor
-)
+_JITTER = 1e-9  # share of a joint's information that every axis gets, so that it has a factor
 _LEAST_INFORMATION = 1e-9  # per square metre, of joints that no camera measures
 
 

@@ -39,9 +39,8 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
         off = seen.pixels - frame.pixels
         error = (off * off).sum(-1) / frame.noise(seen.by_joint)
         agree = there & seen.in_front & (error < _AGREE**2)
-        score = (
-            agree.to(error) - torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
-        ).sum(1)
+        misfit = torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
+        score = (agree.to(error) - misfit).sum(1)
         score = torch.where(agree[:, a] & agree[:, b], score, -1.0)
         chosen = torch.where((score > best)[:, None], agree, chosen)
         best = torch.maximum(best, score)

@@ -16,9 +16,7 @@ _DISAGREES = 0.5  # share of a camera's keypoints that fit no joint, above which
 _UNSURE = 0.1  # confidence below which half of the keypoints hardly count
 _MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
 _GAP = 30  # frames without keypoints that are worth a word
-_LEAST_TURN = (
-    0.3  # degrees by which keypoints of a camera are turned back, from which on it is said
-)
+_LEAST_TURN = 0.3  # degrees by which keypoints are turned back, from which on it is said
 _STRAYS = 30.0  # percent of its frames in which a camera has a detection that fits no person
 _HEIGHTS = (1.0, 2.3)  # metres, of a person beyond which it is said
 # Factor of the height from which on it is another one; proportions differ by less.

@@ -37,19 +37,8 @@ FEW_HEADINGS = 2
 """Headings that are enough where bodies are only compared."""
 
 _HEADINGS = 8
-_WIDTHS = (
-    400.0,
-    200.0,
-    100.0,
-    50.0,
-    25.0,
-    12.0,
-    6.0,
-    3.0,
-    1.5,
-    1.0,
-    1.0,
-)  # factors of the noise's variance
+# Factors of the noise's variance.
+_WIDTHS = (400.0, 200.0, 100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0, 1.0)
 _WIDER = 16.0  # factor of the variance of cameras whose calibration may be wrong
 _WIDTHS_OF_ONE = _WIDTHS[-5:]
 _POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is

@@ -477,11 +477,8 @@ class KeypointTracker(nn.Module):
         wider = jumped + widened.carried
         begun = beginnings(poses.started, poses.coasting, self.filter.fps)
         for rows, part in smooth(self.filter, states, wider, begun, poses.coasting):
-            write_part(
-                _smoothed_fields(poses),
-                rows,
-                _smoothed_fields(self._as_smoothed(part_of(poses, rows), part)),
-            )
+            smoothed = self._as_smoothed(part_of(poses, rows), part)
+            write_part(_smoothed_fields(poses), rows, _smoothed_fields(smoothed))
         return poses
 
     def _as_smoothed(self, poses: KeypointPoses, smoothed: BodyMoments) -> KeypointPoses:

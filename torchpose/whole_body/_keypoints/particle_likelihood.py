@@ -105,9 +105,8 @@ def limbs_given_keypoints(
     turns = turns @ quaternion_vector_to_matrix(within_unit_ball(points))
     moved = (turns[..., :3, :, :] - turns[..., 3:, :, :])[:, :, part] / apart
     offsets = body.joint_weights[_ROOT // 2 :].unflatten(0, (-1, 3))[part, :, carried]
-    by_point = (
-        (moved @ offsets[:, None, :, None]).squeeze(-1).mT.to(measured.maps.shift)
-    )  # H [B, N, J', 3, 3]
+    by_point = (moved @ offsets[:, None, :, None]).squeeze(-1).mT  # H [B, N, J', 3, 3]
+    by_point = by_point.to(measured.maps.shift)
     # predicted where the part may be, a keypoint that is off by that much is no outlier
     spread = by_point.new_zeros(*joints.shape, 3)
     spread[:, :, carried] = by_point @ by_point.mT

@@ -303,9 +303,8 @@ class PeopleTracker:
         agreed = n_seen >= self.agreeing
         hits = stream.hits + agreed.to(stream.hits)
         doubled = _doubled(found.poses.joints)
-        new = (
-            (stream.identity == 0) & ~doubled & (hits >= max(_CONFIRM_FRAMES, _CONFIRM_TIME * fps))
-        )
+        confirmed = hits >= max(_CONFIRM_FRAMES, _CONFIRM_TIME * fps)
+        new = (stream.identity == 0) & ~doubled & confirmed
         identity = torch.where(new, stream.n_confirmed + new.cumsum(0), stream.identity)
         unseen = torch.where(n_seen > 0, 0.0, stream.unseen + 1.0)
         return stream._replace(

@@ -79,9 +79,8 @@ def fit_radii(
         drawn = mean + spread * noise
         drawn[0] = mean  # the first one of all is the body as it is
         factors = drawn.exp()[:, kinds, None].to(limbs.radii)
-        score = _overlap(limbs, factors, rig, prepared) - _PRIOR * (drawn / _SPREAD).square().mean(
-            -1
-        )
+        cost = _PRIOR * (drawn / _SPREAD).square().mean(-1)
+        score = _overlap(limbs, factors, rig, prepared) - cost
         ranked = score.argsort(descending=True, stable=True)
         elite = drawn[ranked[: max(round(_ELITE * n_candidates), 2)]]
         if float(score[ranked[0]]) > best_score:
