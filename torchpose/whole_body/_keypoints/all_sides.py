@@ -21,7 +21,7 @@ def notes_on_all_sides(filter: BodyKalmanFilter, frames: KeypointFrame) -> tuple
     Args:
         filter: of two cameras or more. frames: keypoints [T, C, J].
     """
-    told = frames.some(((frames.inlier > 0).sum(1) >= 2).sum(-1) >= _LEAST_JOINTS, _FRAMES)
+    told = frames.some((frames.there.sum(1) >= 2).sum(-1) >= _LEAST_JOINTS, _FRAMES)
     gains = torch.zeros(0)
     for part in zip(*(value.split(_AT_A_TIME) for value in told), strict=True):
         gains = torch.cat([gains, _gains(filter, KeypointFrame(*part)).cpu()])

@@ -15,12 +15,12 @@ _AWAY = 0.5  # share of a lost frame that one without anybody counts: a second u
 
 def sees_enough(frame: KeypointFrame) -> Bool[Tensor, "B C"]:
     """Return which cameras see enough joints of a person to tell by themselves where it is."""
-    return (frame.inlier > 0.0).sum(-1) >= LEAST_JOINTS
+    return frame.there.sum(-1) >= LEAST_JOINTS
 
 
 def sees_most(frame: KeypointFrame) -> Int[Tensor, " B"]:
     """Return the camera that sees the most joints, the first of several."""
-    return (frame.inlier > 0.0).sum(-1).argmax(-1)
+    return frame.there.sum(-1).argmax(-1)
 
 
 def may_begin(frame: KeypointFrame, waited: Float[Tensor, " B"], fps: float) -> Bool[Tensor, " B"]:
@@ -30,7 +30,7 @@ def may_begin(frame: KeypointFrame, waited: Float[Tensor, " B"], fps: float) -> 
         frame: the keypoints. waited: frames for which a second camera has been waited for.
         fps: frames per second.
     """
-    there = frame.inlier > 0.0
+    there = frame.there
     n_needed = min(2, there.shape[-2])
     enough = (there.sum(-2) >= n_needed).sum(-1) >= LEAST_JOINTS
     return enough | ((waited > _PATIENCE * fps) & sees_enough(frame).any(-1))
@@ -43,7 +43,7 @@ def first_frames(frames: KeypointFrame, fps: float) -> Int[Tensor, " B"]:
         frames: [B, T, C, J, ...]. fps: frames per second.
     """
     count = len(frames.pixels)
-    there = (frames.inlier > 0.0).flatten(2).any(-1)
+    there = frames.there.flatten(2).any(-1)
     waited = there.cumsum(-1) - there.long()
     every = frames.map(lambda value: value.flatten(0, 1))
     enough = may_begin(every, waited.flatten().to(every.inlier), fps).view(count, -1)

@@ -318,7 +318,7 @@ class BodyKalmanFilter(nn.Module):
         Such a pelvis has to go along with the trunk. It would lag behind who walks, since its own speed is
         expected to decay, and the trunk would lean over more and more.
         """
-        seen = (frame.inlier > 0.0).any(1)
+        seen = frame.there.any(1)
         hips = index_tensor(_HIPS, seen.device)
         rows = seen.any(-1) & ~seen.index_select(-1, hips).any(-1) & (len(self.maps.shift) > 1)
         return rows.nonzero().squeeze(-1)

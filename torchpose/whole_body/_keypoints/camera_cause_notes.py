@@ -83,8 +83,8 @@ def find_cause(rig: CameraRig, frames: KeypointFrame) -> CameraCause | None:
         rig: two cameras or more. frames: keypoints [T, C, J].
     """
     moving = without_still_frames(frames)
-    some = moving.some((moving.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
-    count = float((some.inlier * ((some.inlier > 0).sum(1, keepdim=True) >= 2)).sum())
+    some = moving.some(moving.there.any(-1).sum(-1) >= 2, _FRAMES)
+    count = float((some.inlier * some.shared).sum())
     if count < _LEAST_KEYPOINTS:
         return None
     n = len(rig)
@@ -192,7 +192,7 @@ def _distorted(rig: CameraRig, frames: KeypointFrame, camera: int) -> KeypointFr
 
 def _distance(found: Explained, row: int, frames: KeypointFrame) -> float:
     """Return how far the farthest fifth of the keypoints is from joints, pixels."""
-    return float(found.pixels[row][frames.inlier > 0].quantile(_MOST))
+    return float(found.pixels[row][frames.there].quantile(_MOST))
 
 
 def _device(frames: KeypointFrame) -> torch.device:

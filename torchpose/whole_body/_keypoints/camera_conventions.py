@@ -74,9 +74,8 @@ def check_conventions(rig: CameraRig, filter: BodyKalmanFilter, frames: Keypoint
     if len(rig) == 1:
         return
     flat = frames.map(lambda value: value.flatten(0, 1))
-    some = flat.some((flat.inlier > 0).any(-1).sum(-1) >= 2, _FRAMES)
-    both = (some.inlier > 0) & ((some.inlier > 0).sum(1, keepdim=True) >= 2)
-    if int(both.sum()) < _LEAST_KEYPOINTS:
+    some = flat.some(flat.there.any(-1).sum(-1) >= 2, _FRAMES)
+    if int(some.shared.sum()) < _LEAST_KEYPOINTS:
         return
     given = float(agreement(filter.maps, some))
     found = _better(rig, filter, some, given)
@@ -216,7 +215,7 @@ def _of_sizes(rig: CameraRig, some: KeypointFrame) -> Iterator[Convention]:
     """
     # as matrices have them
     sides = (2 * rig.matrix[:, :2, 2] + 1).clamp_min(1).to(some.pixels)[:, None]
-    used = float((some.pixels / sides).amax(-1)[some.inlier > 0].quantile(_MOST))
+    used = float((some.pixels / sides).amax(-1)[some.there].quantile(_MOST))
     for one, of in _SCALES:
         s = one / of
         if (s < 1 and used > s) or (s > 1 and used < 1):

@@ -48,7 +48,7 @@ def log_factors(maps: RigMaps, frame: KeypointFrame, motion: BodyMotion) -> Tens
     Args:
         maps: the cameras. frame: keypoints [B, C, J]. motion: of the person who is expected.
     """
-    joints, there = triangulate(maps, frame), frame.inlier > 0
+    joints, there = triangulate(maps, frame), frame.there
     agreed = joints.isfinite().all(-1)
     if int(agreed.sum()) < _AGREED * int((there.sum(1) >= 2).sum()):
         return joints.new_zeros(0)

@@ -65,7 +65,7 @@ def _pair_costs(
     best delay.
     """
     F = _fundamental(rig, a, b)
-    there = frames.inlier > 0
+    there = frames.there
     found = []
     for delay in range(-longest, longest + 1):
         first, second = _rows(len(there), delay)

@@ -109,7 +109,7 @@ def any_wrong(off: Bool[Tensor, "B C"], turn: Float[Tensor, "B C 3 3"]) -> Bool[
 
 def noted(faults: CameraFaults, frame: KeypointFrame, used: KeypointFrame) -> CameraFaults:
     """Return the faults with a frame kept for the next one, and of `without_still` what of it is used."""
-    there, use = ((one.inlier > 0.0).any(-1) for one in (frame, used))
+    there, use = (one.there.any(-1) for one in (frame, used))
     still = torch.where(there & ~use, faults.still + 1.0, 0.0)
     return faults._replace(pixels=frame.pixels, inlier=frame.inlier, still=still)
 
@@ -127,7 +127,7 @@ def without_still(
     moved = (frame.pixels != pixels).any(-1)
     if bool(moved.any(-1).all()):
         return frame
-    both = (frame.inlier > 0) & (inlier > 0)
+    both = frame.there & (inlier > 0)
     count, n_moved = both.sum(-1), (moved & both).sum(-1)
     most_moved = (2 * n_moved > count) & (count >= LEAST_JOINTS)
     still = ~moved.any(-1) & (count >= LEAST_JOINTS) & most_moved.any(-1, keepdim=True)
@@ -206,7 +206,7 @@ def _of_nobody(
     frame: KeypointFrame, off: Bool[Tensor, "B C"], maps: RigMaps
 ) -> Float[Tensor, " B"]:
     """Return minus the log density of keypoints of cameras that are off, which may be anywhere."""
-    of_nobody = (frame.inlier > 0) & off[..., None]
+    of_nobody = frame.there & off[..., None]
     return (of_nobody * maps.log_area[:, None]).sum((-2, -1))
 
 

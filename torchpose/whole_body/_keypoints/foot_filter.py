@@ -164,7 +164,7 @@ class FootFilter(nn.Module):
         G = HP @ H.mT
         covs = point_blocks(G)
         inlier = torch.zeros_like(frame.inlier)
-        if bool((frame.inlier > 0).any()):
+        if bool(frame.there.any()):
             exchange = Exchange(self._mirror, self._legs)
             readings, seen = readings_of(frame, exchange), see(maps, points.flatten(1, 2))
             weighed = weigh(

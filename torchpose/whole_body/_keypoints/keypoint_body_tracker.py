@@ -248,7 +248,7 @@ class KeypointBodyTracker(nn.Module):
         Raises:
             NobodySeenError: one of them never does.
         """
-        seen = (frames.inlier > 0).flatten(1).any(-1)
+        seen = frames.there.flatten(1).any(-1)
         if not bool(seen.all()):
             raise NobodySeenError(
                 f"sequence {int((~seen).nonzero()[0])} has no keypoint in any camera and frame"
@@ -322,7 +322,7 @@ class KeypointBodyTracker(nn.Module):
         )  # fmt: skip
         late = late_note(result.first_frame, TOO_FEW)
         given = frames.map(lambda value: value[0])
-        still = notes_on_still_cameras(self.rig.names, given.pixels, given.inlier > 0, first_frame)
+        still = notes_on_still_cameras(self.rig.names, given.pixels, given.there, first_frame)
         notes = (*notes_on_refined(self.rig.names, found), *still, *result.notes, *late)
         details = details_of_cameras(found, len(result))
         return replace(result, notes=notes, details={**result.details, **details})

@@ -71,6 +71,16 @@ class KeypointFrame(NamedTuple):
     relative: Tensor
     inlier: Tensor
 
+    @property
+    def there(self) -> Bool[Tensor, "... C J"]:
+        """Return which keypoints there are."""
+        return self.inlier > 0.0
+
+    @property
+    def shared(self) -> Bool[Tensor, "... C J"]:
+        """Return which keypoints there are of joints that two cameras see, or more."""
+        return self.there & (self.there.sum(-2, keepdim=True) >= 2)
+
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """Return the keypoints with a function applied to every tensor."""
         return type(self)(*(change(value) for value in self))
@@ -226,7 +236,7 @@ def weigh(
         width: factor of the noise's variance.
     """
     variance = (width * beliefs.scale)[..., None] * readings.noise(seen.by_joint)
-    inlier, there = readings.inlier, readings.inlier > 0.0
+    inlier, there = readings.inlier, readings.there
     present = there & seen.in_front
     off = readings.pixels - seen.pixels
     density = _log_density(off, seen.by_joint, joint_cov, variance, marginal)

@@ -131,7 +131,7 @@ def _by_wider(
     agree may as well see two persons.
     """
     share = found.weighed.inlier.sum((-2, -1)) / frame.inlier.sum((-2, -1))
-    several = (frame.inlier > 0).any(-1).sum(-1) > 2
+    several = frame.there.any(-1).sum(-1) > 2
     rows = ((share < FEW_INLIERS) & several).nonzero().squeeze(-1)
     if not len(rows):
         return found

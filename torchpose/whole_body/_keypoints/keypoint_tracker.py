@@ -342,7 +342,7 @@ class KeypointTracker(nn.Module):
         by_one = self._lone_tracker(camera).advance(own, seen)
         stream, pose, found = step_by_one(step, by_one, camera)
         if before is not None:
-            gone = ~(seen.inlier > 0).flatten(1).any(-1) & sees_enough(frame).any(-1)
+            gone = ~seen.there.flatten(1).any(-1) & sees_enough(frame).any(-1)
             stream = stream._replace(lost=torch.where(gone, before.lost + 1, stream.lost))
         cov = self.poses.covariance(found.joint_cov, found.joints, pose.alone, pose.spread)
         return stream, pose._replace(covariance=cov), found
@@ -436,7 +436,7 @@ class KeypointTracker(nn.Module):
 
         Otherwise it would lift somebody who returns to the pose of who left for half a second.
         """
-        nobody = ~(frame.inlier > 0).flatten(1).any(-1)
+        nobody = ~frame.there.flatten(1).any(-1)
         rows = (nobody & are_lost(stream.lost, self.filter.fps)).nonzero().squeeze(-1)
         if not len(rows):
             return stream.memory

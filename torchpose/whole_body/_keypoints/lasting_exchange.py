@@ -63,5 +63,5 @@ def are_wrong(evidence: Float[Tensor, "B C 2"]) -> Bool[Tensor, "B C 2"]:
 def _few_see(filter: BodyKalmanFilter, frame: KeypointFrame) -> Bool[Tensor, "B 2"]:
     """Return of whose arms and legs few cameras see most."""
     groups = filter.exchange.groups
-    share = (frame.inlier > 0).to(groups) @ groups.mT / groups.sum(-1)
+    share = frame.there.to(groups) @ groups.mT / groups.sum(-1)
     return (share >= _SEEN).sum(1) <= _MOST_CAMERAS

@@ -54,7 +54,7 @@ class KeypointMeasurement(NamedTuple):
     @property
     def seen(self) -> Bool[Tensor, " B"]:
         """Return whether there is any keypoint."""
-        return (self.frame.inlier > 0).flatten(1).any(1)
+        return self.frame.there.flatten(1).any(1)
 
 
 def keypoint_log_likelihood(

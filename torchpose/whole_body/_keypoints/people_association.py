@@ -66,7 +66,7 @@ def detection_gains(
         readings_of(pairs, filter.exchange), seen, filter.maps, beliefs, filter.exchange,
         joint_cov[persons], marginal=True, width=width,
     )  # fmt: skip
-    there = pairs.inlier > 0.0
+    there = pairs.there
     about = _of_another(seen, joint_cov[persons])
     of_another = torch.where(seen.in_front, about, -filter.maps.log_area[:, None])
     gain = (weighed.log_joint - torch.where(there, of_another, 0.0)).sum(-1)
@@ -189,7 +189,7 @@ def group_detections(
     best, joined = gains.max(-1)
     groups = torch.where(pairs >= 0, pairs, torch.where(best > 0, joined, -1))
     score = torch.where(pairs >= 0, of_pair, best.clamp_min(0)).sum(-1) - _bone_penalty(joints)
-    there = (taken_detections(frame, pairs).inlier > 0).sum(1) == 2
+    there = taken_detections(frame, pairs).there.sum(1) == 2
     enough = known.sum(-1) >= (_AGREE * there.sum(-1)).clamp_min(LEAST_JOINTS)
     enough &= ((of_pair > 0) | (pairs < 0)).all(-1)
     return _disjoint(groups, torch.where(enough, score, -math.inf))
@@ -226,7 +226,7 @@ def _agreement(
     log_in = -0.5 * square / variance - (2 * math.pi * variance).log()
     outside = torch.log1p(-frame.inlier) - maps.log_area[:, None]
     both = torch.logaddexp(frame.inlier.clamp_min(1e-30).log() + log_in, outside)
-    there = (frame.inlier > 0) & (known[:, None] & seen.in_front)[:, None]
+    there = frame.there & (known[:, None] & seen.in_front)[:, None]
     gains = torch.where(there, both - _of_another(seen)[:, None], 0.0)
     return gains.sum(-1).mT
 

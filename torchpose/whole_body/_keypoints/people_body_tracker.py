@@ -96,7 +96,7 @@ class PeopleBodyTracker:
         check_choice("smoothing", smoothing, SMOOTHING)
         check_shape("keypoints", keypoints, ["T", len(self.single.rig), "D", None, 2])
         frames, feet = self._frames(keypoints, confidence, names, covariance)
-        if not bool((frames.inlier > 0).any()):
+        if not bool(frames.there.any()):
             raise NobodySeenError("the detections have no keypoint in any camera and frame")
         stream, rows = None, defaultdict[int, list[_Row]](list)
         strays = torch.zeros(frames.inlier.shape[0], frames.inlier.shape[2], dtype=torch.bool)
@@ -114,7 +114,7 @@ class PeopleBodyTracker:
         self._check_cameras([row for _, i in named for row in persons[i]])
         if not named:
             self._check_cameras_of_pairs(frames)
-        there = (frames.inlier > 0).any(-1).any(1).cpu()
+        there = frames.there.any(-1).any(1).cpu()
         notes = notes_on_strays(self.single.rig.names, strays, there)
         tracks = [self._track(persons[i], who, feet, smoothing == "full") for who, i in named]
         return [replace(track, notes=track.notes + notes) for track in tracks]
@@ -195,7 +195,7 @@ class PeopleBodyTracker:
         filter = self.single.tracker.filter
         if len(filter.maps.shift) == 1:
             return
-        there = (frames.inlier > 0).any(-1)
+        there = frames.there.any(-1)
         single = (there.sum(1) <= 1).all(-1)
         cameras = torch.arange(there.shape[2])
         first = there[single].int().argmax(1)
@@ -208,7 +208,7 @@ class PeopleBodyTracker:
         ]
         found: KeypointFrame = joined(pairs)
         agreed = triangulate(filter.maps, found).isfinite().all(-1).sum(-1)
-        both = ((found.inlier > 0).sum(1) >= 2).sum(-1)
+        both = (found.there.sum(1) >= 2).sum(-1)
         rows = (agreed > _AGREED * both).nonzero().squeeze(-1)
         check_units(filter, found.take(rows).map(lambda value: value[:, None]))
 

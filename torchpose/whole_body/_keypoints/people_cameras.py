@@ -67,7 +67,7 @@ def watched_cameras(
     faults = looked_at_again(tracker.filter, faults, beside)
     started = tracked[1].started.any() & (faults.looks.n_frames == 0)
     astray = started | strays.any()
-    witness = (frame.inlier > 0).sum((-2, -1)).argmax()[None]
+    witness = frame.there.sum((-2, -1)).argmax()[None]
     bodies, _, found = taken(tracked, witness)
     several = bodies.begun & (bodies.alone < 0)
     right = righted(tracker, frame.take(witness), faults)
@@ -106,7 +106,7 @@ def strays_of(frame: KeypointFrame, chosen: Int[Tensor, "P C"]) -> Bool[Tensor, 
 
 def _of_witnesses(frame: KeypointFrame) -> KeypointFrame:
     """Return the keypoints [1, C, W J] of the W persons who have most, side by side."""
-    count = (frame.inlier > 0.0).sum((-2, -1))
+    count = frame.there.sum((-2, -1))
     rows = count.topk(min(_WITNESSES, len(count))).indices.sort().values
     some = frame.take(rows)
     none = frame.map(lambda value: value.new_ones(_WITNESSES - len(rows), *value.shape[1:]))

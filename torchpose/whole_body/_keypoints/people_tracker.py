@@ -108,7 +108,7 @@ class PeopleTracker:
         """
         stream = _nobody(frame) if stream is None else stream
         detected, frame = frame, righted(self.tracker, frame, stream.faults)
-        there = (frame.inlier > 0.0).any(-1).mT  # [C, D]
+        there = frame.there.any(-1).mT  # [C, D]
         found, free, predicted = None, there, None
         if stream.bodies is not None:
             stream, found, free, predicted = self._followed(stream, frame, there)
@@ -243,7 +243,7 @@ class PeopleTracker:
         A person whose detections are in a group stays the same. Another with detections in it was nobody.
         """
         frame = righted(self.tracker, detected, stream.faults)
-        groups = group_detections(self.tracker.filter.maps, frame, (frame.inlier > 0).any(-1).mT)
+        groups = group_detections(self.tracker.filter.maps, frame, frame.there.any(-1).mT)
         shares = _owners(groups, found, torch.ones_like(stream.number, dtype=torch.bool))
         owner = shares & (shares.cumsum(0) == 1)
         owner = owner & (owner.cumsum(1) == 1)
@@ -369,7 +369,7 @@ def _owned_by(
 
 def _explained(poses: KeypointPoses, keypoints: KeypointFrame) -> Float[Tensor, " P"]:
     """Return the share of persons' keypoints that are those of their bodies."""
-    count = (keypoints.inlier > 0).sum((-2, -1)).clamp_min(1)
+    count = keypoints.there.sum((-2, -1)).clamp_min(1)
     return poses.inlier.sum((-2, -1)) / count
 
 

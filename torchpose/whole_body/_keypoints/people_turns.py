@@ -77,7 +77,7 @@ def turns_of_all(
 def _groups(filter: BodyKalmanFilter, frame: KeypointFrame, width: float) -> Int[Tensor, "G C"]:
     """Return the detections of persons by a noise whose variance is larger by a factor."""
     wide = frame._replace(variance=width * frame.variance, relative=width * frame.relative)
-    return group_detections(filter.maps, wide, (frame.inlier > 0).any(-1).mT)
+    return group_detections(filter.maps, wide, frame.there.any(-1).mT)
 
 
 def _evidence(
@@ -86,7 +86,7 @@ def _evidence(
     """Return the log density of all keypoints of a frame in cameras that are turned."""
     right = turned(frame, turn, filter.maps)
     groups = _groups(filter, right, 1.0)
-    nobodys = ~owned_detections(groups, len(frame.inlier)).mT[..., None] & (frame.inlier > 0)
+    nobodys = ~owned_detections(groups, len(frame.inlier)).mT[..., None] & frame.there
     evidence = -float((nobodys * filter.maps.log_area[:, None]).sum())
     if len(groups):
         found = start(filter, taken_detections(right, groups), FEW_HEADINGS)

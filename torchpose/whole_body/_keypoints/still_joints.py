@@ -72,7 +72,7 @@ def with_still_joints(
     Args:
         filter: that predicted. state: the predictions. still: of the frame before. frame: the keypoints.
     """
-    seen = (frame.inlier > 0).any(1)
+    seen = frame.there.any(1)
     p = still.probability.masked_fill(seen | ~seen.any(-1, keepdim=True), 0.0)
     rows = (p > _LEAST).any(-1).nonzero().squeeze(-1)
     if not len(rows):

@@ -150,9 +150,9 @@ class TrackBuilder:
         refined: RefinedCameras | None,
         first_frame: int,
     ) -> tuple[str, ...]:
-        still = notes_on_still_cameras(self.rig.names, frame.pixels, frame.inlier > 0, first_frame)
+        still = notes_on_still_cameras(self.rig.names, frame.pixels, frame.there, first_frame)
         frame = without_still_frames(frame)  # which did not count
-        there = frame.inlier > 0
+        there = frame.there
         notes = notes_of(
             self.rig.names, there, poses.inlier, poses.exchanged, poses.coasting, poses.alone,
             poses.off, self.sized, first_frame,

@@ -111,7 +111,7 @@ def find_turns(
         joints = triangulate_without(maps, frame, free & ~free.all(-1, keepdim=True))
     else:
         turn, widths = known, _WIDTHS_OF_KNOWN
-        joints = triangulate_all(maps, turned(frame, turn, maps), frame.inlier > 0)
+        joints = triangulate_all(maps, turned(frame, turn, maps), frame.there)
     rotvec = _rotvec(turn)
     for width in widths:
         large = 1.0 + rotvec.square().sum(-1) / _TURN**2
