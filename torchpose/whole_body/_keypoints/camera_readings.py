@@ -89,9 +89,8 @@ def _poses(rig: CameraRig, maps: RigMaps, some: KeypointFrame) -> list[_Reading]
 
 def _disagreeing(maps: RigMaps, some: KeypointFrame) -> list[int]:
     """Return the cameras of whose keypoints few agree with others on a joint."""
-    there = some.inlier > 0
-    both = there & (there.sum(1, keepdim=True) >= 2)
-    share = (agreeing(maps, some) & both).sum((0, 2)) / both.sum((0, 2)).clamp_min(1)
+    good = agreeing(maps, some).chosen & some.shared
+    share = good.sum((0, 2)) / some.shared.sum((0, 2)).clamp_min(1)
     return (share < _FEW).nonzero().flatten().tolist()
 
 

@@ -1,6 +1,7 @@
 """Triangulate joints by the cameras that agree on them."""
 
 from itertools import combinations
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,25 +12,31 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, R
 _AGREE = 6.0  # standard deviations of the noise within which a camera agrees
 
 
+class Agreed(NamedTuple):
+    """Holds the keypoints [B, C, J] that agree on joints, and joints [B, J, 3] by all of these."""
+
+    chosen: Tensor
+    joints: Tensor
+
+
 def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
     """Return joints by the cameras that agree, NaN where no two do.
 
     The pair of cameras that most others agree with decides; all that agree then count, by linear least
     squares of u (M p + m)_3 = (M p + m)_12.
     """
-    chosen = agreeing(maps, frame)
-    joints = triangulate_all(maps, frame, chosen)
+    chosen, joints = agreeing(maps, frame)
     return torch.where((chosen.sum(1) >= 2)[..., None], joints, torch.nan)
 
 
-def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
-    """Return the keypoints of the cameras that agree on a joint.
+def agreeing(maps: RigMaps, frame: KeypointFrame) -> Agreed:
+    """Return the keypoints of the cameras that agree on a joint, and where they have it.
 
     Args:
         maps: the cameras. frame: the keypoints.
     """
     normal, right = _normal_equations(maps, frame)
-    there = frame.inlier > 0.0
+    there = frame.there
     best = torch.full_like(frame.variance[:, 0], -1.0)
     chosen = torch.zeros_like(there)
     for a, b in combinations(range(len(maps.shift)), 2):
@@ -44,7 +51,7 @@ def agreeing(maps: RigMaps, frame: KeypointFrame) -> Bool[Tensor, "B C J"]:
         score = torch.where(agree[:, a] & agree[:, b], score, -1.0)
         chosen = torch.where((score > best)[:, None], agree, chosen)
         best = torch.maximum(best, score)
-    return chosen
+    return Agreed(chosen, _by_some(normal, right, chosen))
 
 
 def agreement(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, ""]:
@@ -65,12 +72,11 @@ def agreement_of_each(
     maps: RigMaps, frame: KeypointFrame
 ) -> tuple[Float[Tensor, " B"], Int[Tensor, " B"]]:
     """Return the sums of `agreement` of each element of the batch, and the numbers of its keypoints."""
-    chosen, there = agreeing(maps, frame), frame.inlier > 0
-    seen = see(maps, triangulate_all(maps, frame, chosen))
+    chosen, joints = agreeing(maps, frame)
+    seen = see(maps, joints)
     error = (seen.pixels - frame.pixels).square().sum(-1) / frame.noise(seen.by_joint)
     good = torch.where(chosen, (1 - error / _AGREE**2).clamp_min(0), 0.0)
-    both = there & (there.sum(1, keepdim=True) >= 2)
-    return torch.where(both, good, 0.0).sum((1, 2)), both.sum((1, 2))
+    return torch.where(frame.shared, good, 0.0).sum((1, 2)), frame.shared.sum((1, 2))
 
 
 def triangulate_all(
@@ -81,9 +87,7 @@ def triangulate_all(
     Args:
         maps: the cameras. frame: the keypoints. use: which of them count.
     """
-    normal, right = _normal_equations(maps, frame)
-    count = use.to(right)[..., None]
-    return _solved((count[..., None] * normal).sum(1), (count * right).sum(1))
+    return _by_some(*_normal_equations(maps, frame), use)
 
 
 def triangulate_without(
@@ -94,9 +98,9 @@ def triangulate_without(
     Args:
         maps: the cameras. frame: the keypoints. left_out: which cameras.
     """
-    there = frame.inlier > 0
-    use = there & ~left_out[..., None]
-    return triangulate_all(maps, frame, torch.where(use.sum(1, keepdim=True) >= 2, use, there))
+    use = frame.there & ~left_out[..., None]
+    enough = use.sum(1, keepdim=True) >= 2
+    return triangulate_all(maps, frame, torch.where(enough, use, frame.there))
 
 
 def _normal_equations(
@@ -108,6 +112,14 @@ def _normal_equations(
     size = torch.linalg.vector_norm(maps.matrix[:, 2], dim=-1)[:, None, None]
     rows, right = rows / size[..., None], right / size
     return rows.mT @ rows, (rows.mT @ right[..., None]).squeeze(-1)
+
+
+def _by_some(
+    normal: Float[Tensor, "B C J 3 3"], right: Float[Tensor, "B C J 3"], use: Bool[Tensor, "B C J"]
+) -> Float[Tensor, "B J 3"]:
+    """Return joints by what some keypoints add to their normal equations."""
+    count = use.to(right)[..., None]
+    return _solved((count[..., None] * normal).sum(1), (count * right).sum(1))
 
 
 def _solved(
