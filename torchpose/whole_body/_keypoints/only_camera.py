@@ -30,7 +30,7 @@ from torchpose.whole_body._keypoints.body_size import (
     units_of_size,
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStep
-from torchpose.whole_body._keypoints.nested import by_parts, mapped
+from torchpose.whole_body._keypoints.nested import mapped
 
 # On the network's standard deviations. With it 90 % ellipsoids hold 89 % of the joints of persons who are
 # strangers to a network that was fitted without them.
@@ -112,10 +112,6 @@ class OnlyCamera:
         Args:
             poses: of T frames, [T].
         """
-        return by_parts(self._from_pelvis, poses, dim=0)
-
-    def _from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
-        """Return `covariance_from_pelvis` of some frames."""
         return relative_covariances(
             self.filter, poses, self._unsure(poses, _guessed_from_pelvis(poses))
         )

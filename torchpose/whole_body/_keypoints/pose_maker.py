@@ -25,7 +25,6 @@ from torchpose.whole_body._keypoints.body_size import outer
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.known_person import std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import telling
-from torchpose.whole_body._keypoints.nested import by_parts
 from torchpose.whole_body._keypoints.only_camera import (
     LASTING,
     relative_covariances,
@@ -125,10 +124,6 @@ class PoseMaker:
         Args:
             poses: of T frames, [T], in cameras side by side.
         """
-        return by_parts(self._from_pelvis, poses, dim=0)
-
-    def _from_pelvis(self, poses: KeypointPoses) -> Float[Tensor, "T J 3 3"]:
-        """Return `covariance_from_pelvis` of some frames."""
         joints, maps = poses.joints, self.filter.maps
         apart, away = joints - joints[..., [_PELVIS], :], joints - maps.centre.mean(0)
         k = torch.where(poses.alone >= 0, 1.0, telling(maps, joints))

@@ -40,7 +40,7 @@ from torchpose.whole_body._keypoints.keypoint_notes import (
 )
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
-from torchpose.whole_body._keypoints.nested import mapped
+from torchpose.whole_body._keypoints.nested import by_parts, mapped
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 from torchpose.whole_body._keypoints.turned_cameras import turned as turned_back
 
@@ -127,7 +127,8 @@ class TrackBuilder:
         }
         of_depths = self.tracker.poses if self.tracker.poses.side_by_side else self.tracker.only
         if of_depths is not None:
-            details[COVARIANCE_FROM_PELVIS] = of_depths.covariance_from_pelvis(poses)
+            found = by_parts(of_depths.covariance_from_pelvis, poses, dim=0)
+            details[COVARIANCE_FROM_PELVIS] = found
         if feet is not None:
             details |= dict(zip(DETAILS_OF_FEET, feet, strict=True))
         if bool(is_turned(poses.turn).any()):
