@@ -144,18 +144,17 @@ def facing_evidence(
     """
     ahead = body.part_rotations(states)[..., 0, :, 2]
     ahead = normalize(ahead - (ahead @ up)[..., None] * up, dim=-1)
-    hip, knee, ankle = (_both_sides(body, states, name) for name in ("hip", "knee", "ankle"))
+    joints, joint = body.joints(states), body.skeleton.joint
+    hip, knee, ankle = (
+        joints[..., [joint(f"left_{name}"), joint(f"right_{name}")], :]
+        for name in ("hip", "knee", "ankle")
+    )
     leg = normalize(ankle - hip, dim=-1)
     bend = (knee - hip) - ((knee - hip) * leg).sum(-1, keepdim=True) * leg
     bend = (bend * ahead[..., None, :]).sum(-1).mean((-2, -1))
     feet = ankle.mean(-2)
     step = ((feet[..., -1, :] - feet[..., 0, :]) * normalize(ahead.mean(-2), dim=-1)).sum(-1)
     return _SURE * ((step / _STEP).tanh() + (bend / _BEND).tanh())
-
-
-def _both_sides(body: Body, states: Tensor, joint: str) -> Float[Tensor, "*batch 2 3"]:
-    rows = [body.skeleton.joint(f"{side}_{joint}") for side in ("left", "right")]
-    return body.joints(states)[..., rows, :]
 
 
 def _mean_log_likelihood(

@@ -24,6 +24,7 @@ from torchpose.math._rotations import (
 )
 from torchpose.whole_body._filters.annealed import anneal
 from torchpose.whole_body._filters.body_frames import check_observation, silhouette_score
+from torchpose.whole_body._filters.body_particles import best_particle
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 
 _ACROSS = 0.1  # metres: how far the middle of a silhouette lies from that of the body
@@ -180,8 +181,7 @@ def find_pose(
         n_headings=n_headings, survival_rate=survival_rate, likelihood=likelihood, limits=limits, up=up,
         facing=facing,
     )  # fmt: skip
-    best = found.log_likelihood.argmax(1)
-    states = found.states[torch.arange(len(best), device=best.device), best]
+    states = best_particle(found.states, found.log_likelihood)
     return states if batched else states[0]
 
 
@@ -353,8 +353,7 @@ def _mean_of_best_mode(
 ) -> Float[Tensor, "B D"]:
     """Return the weighted mean of the particles that face about the same way as the best one."""
     log_weights = log_weights.nan_to_num(0.0, neginf=-torch.inf)  # all of them ruled out: alike
-    best = log_weights.argmax(1)
-    chosen = particles[torch.arange(len(best), device=best.device), best][:, None]
+    chosen = best_particle(particles, log_weights)[:, None]
     turned = body.difference(particles, chosen)[..., 3:6].norm(dim=-1)
     kept = log_weights.masked_fill(turned > _ONE_MODE, -torch.inf)
     return body.mean(particles, kept.to(particles))
