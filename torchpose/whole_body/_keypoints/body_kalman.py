@@ -27,7 +27,7 @@ from torchpose._core.module_state import derived, index_tensor
 from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
-from torchpose.math._gaussian import point_blocks
+from torchpose.math._gaussian import point_blocks, symmetrise
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_transition import (
     BodyTransition,
@@ -283,7 +283,7 @@ class BodyKalmanFilter(nn.Module):
         gap, variance, H = expected
         HP = H @ state.cov
         spread = HP @ H.mT + torch.diag_embed(variance / share)
-        chol = torch.linalg.cholesky((spread + spread.mT) / 2.0)
+        chol = torch.linalg.cholesky(symmetrise(spread))
         U = torch.linalg.solve_triangular(chol, HP, upper=False)
         step = (HP.mT @ torch.cholesky_solve(gap[..., None], chol)).squeeze(-1)
         mean = self.articulation.moved(state.mean, step)
@@ -470,7 +470,7 @@ class BodyKalmanFilter(nn.Module):
         scale, told = self._next_scale(state, readings, seen, weighed, joint_cov)
         after = BodyGaussian(
             a.swung(point, joints),
-            (cov + cov.mT) / 2.0,
+            symmetrise(cov),
             torch.logit(weighed.exchanged, LEAST_ODDS),
             scale,
             state.doubt,

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.math._gaussian import symmetrise
 
 # Chosen on the fitted persons of `benchmarks.keypoint_bodies`.
 _ANKLE = 0.09  # metres above the floor
@@ -100,7 +101,7 @@ def told_by_floor(
     weight = seen * _on_the_floor(off, told + noise) / max(1.0, _TIME * fps)
     gain = HP * (weight / (noise + weight * told))[..., None]
     cov = size.cov - gain[..., None] * HP[..., None, :]
-    return SizeBelief(size.mean + gain * off[..., None], (cov + cov.mT) / 2)
+    return SizeBelief(size.mean + gain * off[..., None], symmetrise(cov))
 
 
 def _on_the_floor(off: Float[Tensor, " B"], variance: Float[Tensor, " B"]) -> Float[Tensor, " B"]:

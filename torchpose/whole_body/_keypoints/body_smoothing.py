@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body._articulation import BodyPoint
-from torchpose.math._gaussian import safe_cholesky
+from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
 from torchpose.whole_body._keypoints.nested import PART, frame_at, mapped, part_of, stacked
 
@@ -120,7 +120,7 @@ def _smoothed(
         off = body.difference(found[-1].mean, expected)
         step = (gains[:, t] @ off[..., None]).squeeze(-1)
         change = gains[:, t] @ (found[-1].cov - predicted[:, t]) @ gains[:, t].mT
-        found.append(BodyMoments(body.moved(mean, step), cov + (change + change.mT) / 2.0))
+        found.append(BodyMoments(body.moved(mean, step), cov + symmetrise(change)))
     smoothed: BodyMoments = stacked(found[:0:-1])
     return smoothed
 

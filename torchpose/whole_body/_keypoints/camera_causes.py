@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig
+from torchpose.math._gaussian import symmetrise
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate_without
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
@@ -137,7 +138,7 @@ def explain(rig: CameraRig, frames: KeypointFrame, causes: Causes) -> Explained:
 
 def _solved(S: Tensor, g: Tensor, prior: Tensor) -> Float[Tensor, "N 8 1"]:
     """Return the solutions of normal equations with a prior."""
-    L = torch.linalg.cholesky((S + S.mT) / 2 + torch.diag_embed(prior))
+    L = torch.linalg.cholesky(symmetrise(S) + torch.diag_embed(prior))
     return torch.cholesky_solve(g[..., None], L)
 
 

@@ -21,7 +21,7 @@ from torchpose._core.module_state import derived
 from torchpose.body._articulation import Articulation
 from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._skeleton import BODY_15, other_side
-from torchpose.math._gaussian import point_blocks, safe_cholesky
+from torchpose.math._gaussian import point_blocks, safe_cholesky, symmetrise
 from torchpose.math._rotations import cross_matrix, exponential
 from torchpose.priors._foot_prior import FootPrior
 from torchpose.whole_body._keypoints.foot_motion import (
@@ -174,7 +174,7 @@ class FootFilter(nn.Module):
             step = information_step(H, HP, G, W, b, torch.zeros_like(state.mean))
             U = step.explained(HP)
             cov = state.cov - U.mT @ U
-            state = state._replace(mean=state.mean + step.step, cov=(cov + cov.mT) / 2)
+            state = state._replace(mean=state.mean + step.step, cov=symmetrise(cov))
             points = points + (H @ step.step[..., None]).unflatten(-2, (3, 3)).squeeze(-1)
             covs, inlier = covs - step.explained_points(G), weighed.inlier
         return state, self._poses(state, legs, points, covs, inlier)

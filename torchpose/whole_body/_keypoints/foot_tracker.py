@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchpose.math._gaussian import safe_cholesky
+from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.whole_body._keypoints.foot_filter import (
     FootFilter,
     FootGaussian,
@@ -107,7 +107,7 @@ def smooth_feet(
             off = mean[:, t + 1] - ahead[:, t - begin]
             mean[:, t] += (C @ off[..., None]).squeeze(-1)
             change = C @ (cov[:, t + 1] - predicted[:, t - begin]) @ C.mT
-            cov[:, t] += (change + change.mT) / 2
+            cov[:, t] += symmetrise(change)
     return states
 
 

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.math._gaussian import symmetrise
+
 _JITTER = 1e-9  # share of a joint's information that every axis gets, so that it has a factor
 _LEAST_INFORMATION = 1e-9  # per square metre, of joints that no camera measures
 
@@ -69,7 +71,7 @@ def _by_blocks(
 
 def plus_one(matrix: Tensor) -> Tensor:
     """Return the symmetric part of a matrix plus the unit matrix."""
-    return (matrix + matrix.mT) / 2.0 + unit(matrix.shape[-1], matrix)
+    return symmetrise(matrix) + unit(matrix.shape[-1], matrix)
 
 
 def unit(size: int, like: Tensor) -> Tensor:

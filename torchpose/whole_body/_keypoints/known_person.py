@@ -9,6 +9,7 @@ from torch import Tensor
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import SkeletonError
+from torchpose.math._gaussian import symmetrise
 from torchpose.priors._body_motion import BodyMotion
 
 _LEGS = ("knee", "ankle")  # joints at the lower ends of their bones
@@ -42,7 +43,7 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     gain = cross / (told @ cross + _HEIGHT_STD**2)
     mean = motion.scale_mean + gain * (wanted - told @ motion.scale_mean)
     cov = motion.scale_cov - gain[:, None] * cross
-    return _with(motion, {"scale_mean": mean, "scale_cov": (cov + cov.mT) / 2})
+    return _with(motion, {"scale_mean": mean, "scale_cov": symmetrise(cov)})
 
 
 def of_one_camera(motion: BodyMotion, told: bool = False) -> BodyMotion:
@@ -61,7 +62,7 @@ def of_one_camera(motion: BodyMotion, told: bool = False) -> BodyMotion:
     along = legs[:, None] * legs / (legs @ legs)
     std = _TOLD_STD if told else _LENGTH_STD
     cov = cov + _LENGTH_STD**2 * (torch.eye(len(cov)).to(cov) - along) + std**2 * along
-    return _with(motion, {"scale_cov": (cov + cov.mT) / 2})
+    return _with(motion, {"scale_cov": symmetrise(cov)})
 
 
 def with_usual_trunk(motion: BodyMotion) -> BodyMotion:
@@ -76,7 +77,7 @@ def with_usual_trunk(motion: BodyMotion) -> BodyMotion:
     expected, std = torch.tensor(list(_TRUNK.values())).to(mean).unbind(-1)
     gain = torch.linalg.solve(H @ cov @ H.mT + torch.diag(std.square()), H @ cov).mT
     cov = cov - gain @ H @ cov
-    given = {"scale_mean": mean + gain @ (expected - H @ mean), "scale_cov": (cov + cov.mT) / 2}
+    given = {"scale_mean": mean + gain @ (expected - H @ mean), "scale_cov": symmetrise(cov)}
     return _with(motion, given)
 
 

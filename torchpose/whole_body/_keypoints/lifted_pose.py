@@ -31,6 +31,7 @@ from torchpose._core.module_state import derived
 from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
+from torchpose.math._gaussian import symmetrise
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._lifting_network import (
     MEMORY,
@@ -41,6 +42,7 @@ from torchpose.priors._lifting_network import (
 from torchpose.whole_body._keypoints.begin_anew import sees_most
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
+from torchpose.whole_body._keypoints.information_step import plus_one
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.known_person import length_of_legs, weights_of_legs
 from torchpose.whole_body._keypoints.lifted_lean import without_lean
@@ -332,13 +334,13 @@ def corrected_by(
         off = scale * (wanted - apart)
         HP = H @ cov
         spread = HP @ H.mT
-        chol = torch.linalg.cholesky((spread + spread.mT) / 2.0 + torch.eye(H.shape[-2]).to(H))
+        chol = torch.linalg.cholesky(plus_one(spread))
         apart_from_mean = off[..., None] + H @ d[..., None]
         d = (HP.mT @ torch.cholesky_solve(apart_from_mean, chol)).squeeze(-1)
         point = body.moved(mean, d)
     U = torch.linalg.solve_triangular(chol, HP, upper=False)
     cov = cov - U.mT @ U
-    return state._replace(mean=point, cov=(cov + cov.mT) / 2.0)
+    return state._replace(mean=point, cov=symmetrise(cov))
 
 
 def _of_expected_size(

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.math._gaussian import block_diagonal
+from torchpose.math._gaussian import block_diagonal, symmetrise
 from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
 from torchpose.whole_body._keypoints.joint_triangulation import (
     triangulate_all,
@@ -118,7 +118,7 @@ def find_turns(
         prior = torch.where(free, 4 / (_TURN**2 * large), _KNOWN)
         prior = prior[..., None].expand_as(rotvec).flatten(1)
         chol, F, b, S, g = _equations(frame, rays @ turn.mT, joints, maps, width)
-        L = torch.linalg.cholesky((S + S.mT) / 2.0 + torch.diag_embed(prior))
+        L = torch.linalg.cholesky(symmetrise(S) + torch.diag_embed(prior))
         step = torch.cholesky_solve((-g - prior * rotvec.flatten(1))[..., None], L)
         joints = joints + torch.cholesky_solve(b + F @ step[:, None], chol).squeeze(-1)
         rotvec = rotvec + step.view_as(rotvec)
