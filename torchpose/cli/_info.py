@@ -171,10 +171,11 @@ def describe_prior(prior: "UpperBodyPrior") -> str:
 
 def describe_poses(path: Path) -> str:
     """Return the frames, shares, uncertainty (as `BodyTrack.joints_std`) and notes of a file of poses."""
+    from torchpose.math._gaussian import mean_std
     from torchpose.upper_body._pose_track import PoseTrack
 
     track = PoseTrack.load(path)
-    std = track.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(0).sqrt()
+    std = mean_std(track.covariance3d)
     n_frames = track.joints3d.shape[1]
     facts = {
         "poses": str(path),

@@ -112,14 +112,15 @@ def _write_csv(path: Path, poses: "BodyTrack") -> None:
     import torch
 
     from torchpose._core.files import atomic_path
+    from torchpose.math._gaussian import mean_std
     from torchpose.whole_body._body_feet import ANKLE_ANGLES
+    from torchpose.whole_body._body_track import points_of
 
-    names, rows = poses.names, torch.cat([poses.joints3d, poses.joints_std()[..., None]], -1)
+    names, points, covariance = points_of(poses)
+    rows = torch.cat([points, mean_std(covariance)[..., None]], -1)
     angles, feet = rows.new_zeros(len(rows), 0), poses.feet
     more: list[str] = []
     if feet is not None:
-        names = (*names, *feet.names)
-        rows = torch.cat([rows, torch.cat([feet.points3d, feet.points_std()[..., None]], -1)], 1)
         angles = feet.angles.rad2deg().flatten(1)
         more = [f"{side}_ankle_{angle}" for side in ("left", "right") for angle in ANKLE_ANGLES]
     columns = [*(f"{n}_{axis}" for n in names for axis in ("x", "y", "z", "std")), *more]

@@ -26,6 +26,11 @@ def symmetrise(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
     return (matrix + matrix.mT) * 0.5
 
 
+def mean_std(cov: Float[Tensor, "... D D"]) -> Float[Tensor, "..."]:
+    """Return the standard deviation along an axis, by the mean of the variances."""
+    return cov.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(0).sqrt()
+
+
 def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
     """Return the Cholesky factor of each matrix, mended where rounding made it indefinite.
 

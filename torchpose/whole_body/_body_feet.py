@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.body._feet import FEET
+from torchpose.math._gaussian import mean_std
 
 DETAILS_OF_FEET = (
     "feet",
@@ -71,8 +73,15 @@ class BodyFeet:
 
     def points_std(self) -> Float[Tensor, "T 6"]:
         """Return the standard deviation of every point, metres: of an axis, by the mean variance."""
-        variance = self.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1)
-        return variance.clamp_min(0).sqrt()
+        return mean_std(self.covariance3d)
+
+
+class TrackedPoints(NamedTuple):
+    """Holds joints, then heels and toes if any: names, places [T, K, 3], covariances [T, K, 3, 3]."""
+
+    names: tuple[str, ...]
+    points3d: Tensor
+    covariance3d: Tensor
 
 
 def feet_of(details: Mapping[str, Tensor]) -> BodyFeet | None:

@@ -15,7 +15,8 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.io._bvh_file import BvhNode, bvh_angles, write_bvh_motion
 from torchpose.io._c3d_file import write_c3d
 from torchpose.io._trc_file import write_trc
-from torchpose.whole_body._body_feet import BodyFeet
+from torchpose.math._gaussian import mean_std
+from torchpose.whole_body._body_feet import BodyFeet, TrackedPoints
 
 BODY_FORMATS = ("trc", "c3d", "bvh")
 UP_AXES = ("z", "y")
@@ -27,15 +28,14 @@ class BodyMotion3d(NamedTuple):
     """Holds what files of bodies are written from.
 
     Attributes:
-        body: the body of the person. state: of that body. joints: metres, world axes.
-        std: of the joints, metres. fps: frames per second. first_frame: number of the first frame.
+        body: the body of the person. state: of that body. points: joints, and those of feet.
+        fps: frames per second. first_frame: number of the first frame.
         feet: of the person, None where they were not tracked.
     """
 
     body: Body
     state: Float[Tensor, "T D"]
-    joints: Float[Tensor, "T J 3"]
-    std: Float[Tensor, "T J"]
+    points: TrackedPoints
     fps: float
     first_frame: int
     feet: BodyFeet | None = None
@@ -54,20 +54,16 @@ def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None) -> N
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     check_choice("the suffix of a file of bodies", kind, BODY_FORMATS)
-    turn = _turn_to_y_up(up).to(motion.joints)
-    joints, std, names = motion.joints, motion.std, motion.body.skeleton.names
-    if motion.feet is not None:
-        joints = torch.cat([joints, motion.feet.points3d.to(joints)], 1)
-        std = torch.cat([std, motion.feet.points_std().to(std)], 1)
-        names = (*names, *motion.feet.names)
-    joints, names = joints @ turn.mT, marker_names(names)
+    names, points, covariance = motion.points
+    turn = _turn_to_y_up(up).to(points)
+    points, names = points @ turn.mT, marker_names(names)
     if kind == "bvh":
         _write_skeleton(path, motion, turn)
     elif kind == "trc":
-        write_trc(path, joints, names, motion.fps, first_frame=motion.first_frame)
+        write_trc(path, points, names, motion.fps, first_frame=motion.first_frame)
     else:
         write_c3d(
-            path, joints, names, motion.fps, std=std, y_up=up is not None,
+            path, points, names, motion.fps, std=mean_std(covariance), y_up=up is not None,
             first_frame=motion.first_frame,
         )  # fmt: skip
 
@@ -118,7 +114,7 @@ def _write_skeleton(path: Path, motion: BodyMotion3d, turn: Float[Tensor, "3 3"]
     toes: list[Tensor] = []
     if motion.feet is not None:
         feet = parts[:, [BODY_15.part_of[a] for a in ANKLES]] @ motion.feet.rotation.cpu().double()
-        toes = [*_toes(motion.feet, motion.joints, feet)]
+        toes = [*_toes(motion.feet, motion.points.points3d, feet)]
         parts = torch.cat([parts, feet], 1)
     nodes = _part_nodes(motion.body, toes)
     parts = turn @ parts

@@ -17,7 +17,8 @@ from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
-from torchpose.whole_body._body_feet import SIZES_OF_FEET, BodyFeet, feet_of
+from torchpose.math._gaussian import mean_std
+from torchpose.whole_body._body_feet import SIZES_OF_FEET, BodyFeet, TrackedPoints, feet_of
 from torchpose.whole_body._body_files import BodyMotion3d, write_body_file
 from torchpose.whole_body._filters.body_particles import first_true
 
@@ -247,8 +248,7 @@ class BodyTrack:
 
     def joints_std(self) -> Tensor:
         """Return the standard deviation of every joint [T, J], metres: of an axis, by the mean variance."""
-        variance = self.covariance3d.diagonal(dim1=-2, dim2=-1).mean(-1)
-        return variance.clamp_min(0).sqrt()
+        return mean_std(self.covariance3d)
 
     def export(self, path: str | Path, *, up: str | None = None) -> None:
         """Write the poses for other programs: ``.trc`` (OpenSim), ``.c3d`` or ``.bvh``, by the suffix.
@@ -269,8 +269,7 @@ class BodyTrack:
         """
         self._check_begun()
         motion = BodyMotion3d(
-            self.body, self.state, self.joints3d, self.joints_std(), self.fps or _FPS,
-            self.first_frame, self.feet,
+            self.body, self.state, points_of(self), self.fps or _FPS, self.first_frame, self.feet
         )  # fmt: skip
         write_body_file(path, motion, up)
 
@@ -287,27 +286,32 @@ class BodyTrack:
             `feet` follow.
         """
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
-        points, covariance, observed = self.joints3d, self.covariance3d, self._observed()
-        names, feet = self.names, self.feet
-        if feet is not None:
-            points = torch.cat([points, feet.points3d.to(points)], 1)
-            covariance = torch.cat([covariance, feet.covariance3d.to(covariance)], 1)
-            observed = torch.cat([observed, (feet.inlier > 0.5).any(1)], 1)
-            names = (*names, *feet.names)
+        names, points, covariance = points_of(self)
         return CameraPoses(
             joints3d=(points @ R.mT + t)[None],
             covariance3d=(R @ covariance @ R.mT)[None],
-            observed=observed[None],
+            observed=self._observed()[None],
             failed_at=torch.full((1,), -1),
             names=names,
             fps=self.fps,
         )
 
-    def _observed(self) -> Bool[Tensor, "T J"]:
-        """Return which joints a camera measured: all of a silhouette, of keypoints those that are inliers."""
+    def _observed(self) -> Bool[Tensor, "T K"]:
+        """Return which points a camera measured: all of a silhouette, of keypoints those that are inliers."""
         seen = ~self.coasting[:, None].expand(-1, len(self.names))
-        inlier = self.details.get("inlier")
-        return seen if inlier is None else seen & (inlier > 0.5).any(1)
+        inlier, feet = self.details.get("inlier"), self.feet
+        seen = seen if inlier is None else seen & (inlier > 0.5).any(1)
+        return seen if feet is None else torch.cat([seen, (feet.inlier > 0.5).any(1)], 1)
+
+
+def points_of(track: BodyTrack) -> TrackedPoints:
+    """Return the joints of a track, and its heels and toes."""
+    joints, feet = TrackedPoints(track.names, track.joints3d, track.covariance3d), track.feet
+    if feet is None:
+        return joints
+    pairs = zip(joints[1:], (feet.points3d, feet.covariance3d), strict=True)
+    values = (torch.cat([own, more.to(own)], 1) for own, more in pairs)
+    return TrackedPoints((*joints.names, *feet.names), *values)
 
 
 def repeat_last(track: BodyTrack, count: int) -> BodyTrack:
