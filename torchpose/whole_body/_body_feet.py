@@ -19,11 +19,11 @@ DETAILS_OF_FEET = (
     "foot_rotation_covariance",
 )
 """Names of the details of a track that hold feet."""
-SIZES_OF_FEET = {
-    "feet": (6, 3), "feet_covariance": (6, 3, 3), "foot_rotation": (2, 3, 3),
-    "foot_rotation_covariance": (2, 3, 3),
+FIELDS_OF_FEET = {
+    "feet": "n T 6 3", "feet_covariance": "n T 6 3 3", "foot_rotation": "n T 2 3 3",
+    "foot_rotation_covariance": "n T 2 3 3",
 }  # fmt: skip
-"""Sizes of details, without that of frames."""
+"""Kinds and sizes of those that are of poses, and not of cameras."""
 ANKLE_ANGLES = ("flexion", "inversion", "rotation")
 """Names of the angles of an ankle."""
 

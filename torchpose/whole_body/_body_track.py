@@ -18,7 +18,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
 from torchpose.math._gaussian import mean_std
-from torchpose.whole_body._body_feet import SIZES_OF_FEET, BodyFeet, TrackedPoints, feet_of
+from torchpose.whole_body._body_feet import FIELDS_OF_FEET, BodyFeet, TrackedPoints, feet_of
 from torchpose.whole_body._body_files import BodyMotion3d, write_body_file
 from torchpose.whole_body._filters.body_particles import first_true
 
@@ -33,6 +33,9 @@ _FRAMES = {
     "respread": "b T",
 }  # kinds and sizes in a file
 _DETAIL = "detail_"  # of the keys of what only some filters report
+_DETAILS = {
+    f"{_DETAIL}{name}": field for name, field in {"inlier": "n T C 15", **FIELDS_OF_FEET}.items()
+}
 _BODY = {
     "bone_lengths": "f 15",
     "offsets": "f 15 3",
@@ -186,12 +189,15 @@ class BodyTrack:
                     f"{path}: expected {key} of {n_frames} frames, got {value.dtype!s:.40} of the sizes "
                     f"{list(value.shape)!s:.60}"
                 )
+        actions = texts(path, "action_names", arrays.get("action_names", np.array(())))
+        fields = {**_DETAILS, f"{_DETAIL}actions": f"n T {len(actions)}"}
+        check_arrays(path, arrays, {key: fields[key] for key in details if key in fields})
         frames: dict[str, Any] = {name: to_tensor(arrays[name]) for name in _FRAMES}
         poses = cls(
             load_body(path),
             **frames,
             details={key.removeprefix(_DETAIL): to_tensor(arrays[key]) for key in details},
-            action_names=texts(path, "action_names", arrays.get("action_names", np.array(()))),
+            action_names=actions,
             method=one_text(path, "method", arrays.get("method", np.array("unknown"))),
             **frame_facts(path, arrays),
         )
@@ -225,25 +231,6 @@ class BodyTrack:
         if not apart <= _APART_OF.get(self.method, _APART):
             raise FileFormatError(
                 f"{path}: expected joints3d where state puts them, they are {apart:.3g} m apart"
-            )
-        actions = self.details.get("actions")
-        if actions is not None and tuple(actions.shape[1:]) != (len(self.action_names),):
-            raise FileFormatError(
-                f"{path}: expected {_DETAIL}actions of {len(self.action_names)} actions, got the sizes "
-                f"{list(actions.shape)}"
-            )
-        for name, sizes in SIZES_OF_FEET.items():
-            value = self.details.get(name)
-            if value is not None and tuple(value.shape[1:]) != sizes:
-                raise FileFormatError(
-                    f"{path}: expected {_DETAIL}{name} of the sizes {[len(self), *sizes]}, got "
-                    f"{list(value.shape)!s:.60}"
-                )
-        inlier = self.details.get("inlier")
-        if inlier is not None and (inlier.ndim != 3 or inlier.shape[2] != len(self.names)):
-            raise FileFormatError(
-                f"{path}: expected {_DETAIL}inlier of cameras and {len(self.names)} joints, got the sizes "
-                f"{list(inlier.shape)!s:.60}"
             )
 
     def joints_std(self) -> Tensor:

@@ -302,9 +302,7 @@ def test_feet_of_another_size_are_refused(tmp_path, tracked):
     path = tmp_path / "body.npz"
     details = {**tracked.details, "feet": tracked.details["feet"][:, :5]}
     BodyTrack(**{**vars(tracked), "details": details}).save(path)
-    with pytest.raises(
-        FileFormatError, match=r"detail_feet of the sizes \[24, 6, 3\], got \[24, 5"
-    ):
+    with pytest.raises(FileFormatError, match=r"\[T, 6, 3\] of detail_feet, got \[24, 5"):
         BodyTrack.load(path)
 
 

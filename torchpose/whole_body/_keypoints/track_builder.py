@@ -11,7 +11,7 @@ from torchpose.body._feet import ANKLES
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
-from torchpose.whole_body._body_feet import DETAILS_OF_FEET, SIZES_OF_FEET
+from torchpose.whole_body._body_feet import DETAILS_OF_FEET, FIELDS_OF_FEET
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.all_sides import notes_on_all_sides
 from torchpose.whole_body._keypoints.camera_cause_notes import notes_on_causes
@@ -200,7 +200,7 @@ def without_poses(track: BodyTrack) -> BodyTrack:
     details = {
         name: torch.full_like(value, torch.nan)
         for name, value in track.details.items()
-        if name in (*SIZES_OF_FEET, COVARIANCE_FROM_PELVIS)
+        if name in (*FIELDS_OF_FEET, COVARIANCE_FROM_PELVIS)
     }
     return replace(track, **values, details={**track.details, **details})
 
