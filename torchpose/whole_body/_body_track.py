@@ -33,9 +33,7 @@ _FRAMES = {
     "respread": "b T",
 }  # kinds and sizes in a file
 _DETAIL = "detail_"  # of the keys of what only some filters report
-_DETAILS = {
-    f"{_DETAIL}{name}": field for name, field in {"inlier": "n T C 15", **FIELDS_OF_FEET}.items()
-}
+_DETAILS = {"inlier": "n T C 15", "feet_inlier": "n T C 6", **FIELDS_OF_FEET}
 _BODY = {
     "bone_lengths": "f 15",
     "offsets": "f 15 3",
@@ -190,7 +188,8 @@ class BodyTrack:
                     f"{list(value.shape)!s:.60}"
                 )
         actions = texts(path, "action_names", arrays.get("action_names", np.array(())))
-        fields = {**_DETAILS, f"{_DETAIL}actions": f"n T {len(actions)}"}
+        fields = {_DETAIL + name: field for name, field in _DETAILS.items()}
+        fields[f"{_DETAIL}actions"] = f"n T {len(actions)}"
         check_arrays(path, arrays, {key: fields[key] for key in details if key in fields})
         frames: dict[str, Any] = {name: to_tensor(arrays[name]) for name in _FRAMES}
         poses = cls(

@@ -298,11 +298,18 @@ def test_feet_are_saved_and_read_back(tmp_path, tracked):
         assert torch.equal(getattr(again.feet, name), getattr(tracked.feet, name))
 
 
-def test_feet_of_another_size_are_refused(tmp_path, tracked):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("feet", r"\[T, 6, 3\] of detail_feet, got \[24, 5, 3\]"),
+        ("feet_inlier", r"\[T, C, 6\] of detail_feet_inlier, got \[24, 5, 6\]"),
+    ],
+)
+def test_feet_of_another_size_are_refused(tmp_path, tracked, name, said):
     path = tmp_path / "body.npz"
-    details = {**tracked.details, "feet": tracked.details["feet"][:, :5]}
-    BodyTrack(**{**vars(tracked), "details": details}).save(path)
-    with pytest.raises(FileFormatError, match=r"\[T, 6, 3\] of detail_feet, got \[24, 5"):
+    five = tracked.details[name][:, [0, 1, 0, 1, 0]]
+    BodyTrack(**{**vars(tracked), "details": {**tracked.details, name: five}}).save(path)
+    with pytest.raises(FileFormatError, match=said):
         BodyTrack.load(path)
 
 
