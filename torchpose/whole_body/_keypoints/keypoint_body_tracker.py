@@ -59,7 +59,7 @@ from torchpose.whole_body._keypoints.known_person import (
     with_height,
 )
 from torchpose.whole_body._keypoints.lone_camera import LoneNoise
-from torchpose.whole_body._keypoints.nested import part_of, taken
+from torchpose.whole_body._keypoints.nested import mapped, part_of, taken
 from torchpose.whole_body._keypoints.track_builder import TrackBuilder, without_poses
 from torchpose.whole_body._keypoints.turned_cameras import angles_of, is_turned
 
@@ -175,8 +175,7 @@ class KeypointBodyTracker(nn.Module):
         frames, feet = self.reader.frames_and_feet(keypoints, confidence, names, covariance)
         single = keypoints.ndim == 4
         if single:
-            frames = frames.map(lambda value: value[None])
-            feet = None if feet is None else feet.map(lambda value: value[None])
+            frames, feet = mapped(lambda value: value[None], (frames, feet))
         n_frames = frames.pixels.shape[1]
         ends = check_lengths(lengths, len(frames.pixels), n_frames, frames.pixels.device)
         frames = _until(frames, ends)
@@ -184,8 +183,7 @@ class KeypointBodyTracker(nn.Module):
         self.check_cameras(frames)
         begun = self.first_frames(frames)
         if refine != "none":
-            frames = frames.map(lambda value: value[:, begun[0] :])
-            feet = None if feet is None else feet.map(lambda value: value[:, begun[0] :])
+            frames, feet = mapped(lambda value: value[:, begun[0] :], (frames, feet))
             refined = self._refined_track(
                 frames, feet, refine, smoothing == "full", progress, begun[0]
             )
@@ -194,8 +192,7 @@ class KeypointBodyTracker(nn.Module):
         found = self.feet_of(poses, feet, smoothing == "full")
         tracks = []
         for b, end in enumerate(ends.tolist()):
-            own, seen = part_of(taken((poses, frames), b), slice(0, end), 0)
-            standing = None if found is None else part_of(taken(found, b), slice(0, end), 0)
+            own, seen, standing = part_of(taken((poses, frames, found), b), slice(0, end), 0)
             track = self.builder.track(own, seen, cameras=b == 0, feet=standing)
             track.notes += late_note(track.first_frame, TOO_FEW)
             tracks.append(repeat_last(track, n_frames - end))
@@ -213,8 +210,8 @@ class KeypointBodyTracker(nn.Module):
     ) -> tuple[LiveBody, BodyTrack]:
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
-        frame, feet = self.reader.frames_and_feet(keypoints, confidence, names, covariance)
-        frame = frame.map(lambda value: value[None])
+        given = self.reader.frames_and_feet(keypoints, confidence, names, covariance)
+        frame, feet = mapped(lambda value: value[None], given)
         before, standing = (None, None) if stream is None else stream
         body, pose, _ = self.tracker.advance(before, frame)
         followed = before is not None and bool(before.begun)
@@ -222,7 +219,6 @@ class KeypointBodyTracker(nn.Module):
             self.check_cameras(frame.map(lambda value: value[:, None]))
         found = None
         if feet is not None:
-            feet = feet.map(lambda value: value[None])
             standing, found = step_feet(self.feet, standing, self.tracker.filter.maps, pose, feet)
         track = self.builder.track(pose, frame, summed_up=False, feet=found, followed=followed)
         faults = taken(body.faults, 0)
@@ -318,7 +314,7 @@ class KeypointBodyTracker(nn.Module):
         standing = self._refined_feet(feet, found, smoothing)
         result = self.builder.track(
             taken(found.poses, 0), found.frames, refined=found, first_frame=first_frame,
-            feet=None if standing is None else taken(standing, 0),
+            feet=taken(standing, 0),
         )  # fmt: skip
         late = late_note(result.first_frame, TOO_FEW)
         given = frames.map(lambda value: value[0])

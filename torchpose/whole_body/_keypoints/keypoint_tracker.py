@@ -305,7 +305,7 @@ class KeypointTracker(nn.Module):
         for camera in alone[alone >= 0].unique().tolist():
             for begins in (True, False):
                 rows = ((alone == camera) & (fresh == begins)).nonzero().squeeze(-1)
-                own = None if begins or before is None else taken(before, rows)
+                own = None if begins else taken(before, rows)
                 if len(rows):
                     after = self._by_camera(camera, own, frame.take(rows), taken(step, rows))
                     step = replaced(step, rows, after)
@@ -459,8 +459,8 @@ class KeypointTracker(nn.Module):
     ) -> CorrectedBody:
         """Return what was found, with the persons who are due begun with this frame."""
         persons = due.nonzero().squeeze(-1)
-        theirs = None if lifted is None else taken(lifted, persons)
-        return replaced(found, persons, self._started(frame.take(persons), theirs))
+        begun = self._started(frame.take(persons), taken(lifted, persons))
+        return replaced(found, persons, begun)
 
     # --- whole sequences --------------------------------------------------------------------------
 

@@ -1,4 +1,7 @@
-"""Apply functions to all tensors of tuples, and of tuples in them; collect those of frames."""
+"""Apply functions to all tensors of tuples, and of tuples in them; collect those of frames.
+
+None, where something is missing, stays None.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,6 +20,8 @@ def mapped(fn: Callable[..., Any], first: Any, *others: Any) -> Any:
         fn: of as many entries as there are tuples. first: a tuple, or an entry by itself.
         others: tuples of the same kind.
     """
+    if first is None:
+        return None
     if not isinstance(first, tuple):
         return fn(first, *others)
     values = (mapped(fn, *parts) for parts in zip(first, *others, strict=True))

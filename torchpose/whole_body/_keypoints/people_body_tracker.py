@@ -139,10 +139,8 @@ class PeopleBodyTracker:
         former = set() if stream is None or stream.numbers is None else set(stream.numbers.tolist())
         tracks = []
         for row in (found.identity > 0).nonzero().flatten().tolist():
-            own = None if feet is None else one_of(feet, row)
-            who = int(found.identity[row])
-            followed = int(found.number[row]) in former
-            one = [_Row(0, row, found)]
+            who, followed = int(found.identity[row]), int(found.number[row]) in former
+            one, own = [_Row(0, row, found)], one_of(feet, row)
             tracks.append(self._track_of(one, who, own, summed_up=False, followed=followed))
         return LivePeople(after, state, found.number), tracks
 
@@ -229,8 +227,7 @@ class PeopleBodyTracker:
                 for row in rows
             ]
             standing = self.single.feet_of(poses, stacked(seen), smoothing)
-            standing = taken(standing, 0)
-        return self._track_of(rows, person, standing, taken(poses, 0))
+        return self._track_of(rows, person, taken(standing, 0), taken(poses, 0))
 
     def _track_of(
         self,

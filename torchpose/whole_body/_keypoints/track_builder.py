@@ -87,12 +87,10 @@ class TrackBuilder:
         """
         live = len(poses.started) == 1
         begun = 0 if live else int(poses.started.int().argmax())
-        poses, frame = mapped(lambda value: value[begun:], (poses, frames))
+        poses, frame, feet = mapped(lambda value: value[begun:], (poses, frames, feet))
         first_frame += begun
         body = self.tracker.filter.articulation
         bones = body.bones(poses.point)
-        if feet is not None:
-            feet = mapped(lambda value: value[begun:], feet)
         rigid = _rigid_body(bones, ~poses.coasting)
         state = rigid.state_of(poses.point.position, body.world_rotations(poses.point))
         notes: tuple[str, ...] = ()
