@@ -22,6 +22,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.errors import InputError, TorchposeError
 from torchpose.evaluation._report import RESULTS, Report
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._recursive_filter import Generators
 from torchpose.io._recordings import Recording
 from torchpose.io._results import replace_own
@@ -125,7 +126,7 @@ class Trials(NamedTuple):
     @property
     def inside(self) -> Bool[Tensor, "B T"]:
         """Return the frame mask [B, T], True up to the length of each sequence."""
-        return torch.arange(self.truth3d.shape[1]) < self.lengths[:, None]
+        return inside_lengths(self.lengths, self.truth3d.shape[1])
 
 
 def centred_on_neck(joints: Float[Tensor, "T 8 3"]) -> Float[Tensor, "T 8 3"]:

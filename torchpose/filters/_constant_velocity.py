@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchpose._core.checks import check_positive, check_shape
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived
+from torchpose.filters._lengths import held_past_lengths, inside_lengths
 from torchpose.filters._measurements import check_lengths
 from torchpose.filters._recursive_filter import check_lag
 from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
@@ -116,7 +117,7 @@ class ConstantVelocityFilter(nn.Module):
         found = self.advance(self.init(z[:, 0]), z)[1]
         if lengths is None:
             return found
-        return _held(found, check_lengths(lengths, len(z), z.shape[1], z.device))
+        return held_past_lengths(found, check_lengths(lengths, len(z), z.shape[1], z.device))
 
     def _run(
         self, state: ConstantVelocityState, z: Tensor
@@ -151,7 +152,7 @@ class ConstantVelocityFilter(nn.Module):
         check_lag(lag)
         inside = check_lengths(lengths, len(z), z.shape[1], z.device)
         found = self.smooth_frames(z, inside, lag)
-        return found if lengths is None else _held(found, inside)
+        return found if lengths is None else held_past_lengths(found, inside)
 
     def smooth_frames(
         self, z: Float[Tensor, "B T N"], lengths: Int[Tensor, " B"] | None, lag: int | None
@@ -162,7 +163,7 @@ class ConstantVelocityFilter(nn.Module):
         frames = torch.arange(n_frames, device=z.device)
         if lengths is None:
             lengths = torch.full((len(z),), n_frames, device=z.device)
-        later = (frames + 1 < lengths[:, None])[..., None, None]
+        later = inside_lengths(lengths - 1, n_frames)[..., None, None]
         known = self._gains().smoother
         gains = known[frames.clamp(max=len(known) - 1)].to(z)
         if lag is None or lag >= n_frames - 1:
@@ -229,13 +230,6 @@ def _next(
     gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
     correction = gain * (z[:, None] - predicted[:, :1])
     return ConstantVelocityState(predicted + correction, state.time + 1), correction
-
-
-def _held(numbers: Float[Tensor, "B T N"], lengths: Int[Tensor, " B"]) -> Float[Tensor, "B T N"]:
-    """Return numbers with the last one of each sequence repeated past its length."""
-    batch, n_frames = numbers.shape[:2]
-    held = torch.minimum(torch.arange(n_frames, device=numbers.device), lengths[:, None] - 1)
-    return numbers[torch.arange(batch, device=numbers.device)[:, None], held]
 
 
 def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

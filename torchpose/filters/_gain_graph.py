@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.module_state import derived, outside_inference
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import Mending
@@ -270,8 +271,8 @@ def _patterns(frames: Measurements) -> Tensor:
     n_frames, n_obs = frames.z.shape[1:]
     bits = 2 ** torch.arange(n_obs, device=frames.z.device)
     patterns = (frames.mask * bits).sum(-1)
-    over = torch.arange(n_frames, device=frames.z.device) >= frames.lengths[:, None]
-    return torch.where(over, patterns[frames.lengths.argmax()], patterns)
+    inside = inside_lengths(frames.lengths, n_frames)
+    return torch.where(inside, patterns, patterns[frames.lengths.argmax()])
 
 
 def mending_of_edges(edges: Sequence[list[Edge]], group: Tensor) -> Mending:

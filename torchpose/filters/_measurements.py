@@ -18,6 +18,7 @@ from torchpose._core.checks import (
 )
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError, ShapeError
+from torchpose.filters._lengths import inside_lengths
 
 
 class Measurements(NamedTuple):
@@ -74,7 +75,7 @@ def check_values(
         raise InputError(f"z must hold at least one sequence of one frame, got {list(z.shape)}")
     z = z.to(like)
     lengths = check_lengths(lengths, batch, n_frames, z.device)
-    inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
+    inside = inside_lengths(lengths, n_frames)
     if mask is None:
         mask = inside[..., None].expand(z.shape)
     else:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpose._core.value_checks import seen_finite, values_visible
 from torchpose._core.wording import counted
 from torchpose.errors import DegenerateFilterWarning
+from torchpose.filters._lengths import held_past_lengths, inside_lengths
 
 
 class StepOutput(NamedTuple):
@@ -146,20 +147,17 @@ def finish_output(
 
     Of filters side by side the estimates of each follow those of the one before.
     """
-    batch, n_frames = log_evidence.shape
-    frames = torch.arange(n_frames, device=mean.device)
+    n_frames = log_evidence.shape[1]
     if not values_visible() or bool((lengths < n_frames).any()):
-        held = torch.minimum(frames, lengths[:, None] - 1)
-        rows = torch.arange(batch, device=mean.device)[:, None]
-        mean, log_weights = mean[rows, held], log_weights[rows, held]
-        cov = None if cov is None else cov[rows, held]
-        inside = frames < lengths[:, None]
+        mean, log_weights = (held_past_lengths(value, lengths) for value in (mean, log_weights))
+        cov = None if cov is None else held_past_lengths(cov, lengths)
+        inside = inside_lengths(lengths, n_frames)
         log_evidence = torch.where(inside, log_evidence, torch.zeros_like(log_evidence))
         work = Mending(*(part * inside for part in work))
     failed_at = first_not_finite(mean)
     failed = failed_at >= 0
     if not values_visible() or bool(failed.any()):
-        lost = (frames >= failed_at[:, None]) & failed[:, None]
+        lost = ~inside_lengths(failed_at, n_frames) & failed[:, None]
         log_weights = log_weights.masked_fill(lost[..., None], float("nan"))
         if values_visible():
             _warn_of_failures(failed_at.unflatten(0, (n_filters, -1)))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import frame_log_likelihood
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
@@ -102,7 +103,7 @@ def _smooth(
     n_frames = frames.z.shape[1]
     reach = n_frames - 1 if lag is None else min(lag, n_frames - 1)
     gains, jitters = _smoother_gains(model, past)
-    later = torch.arange(1, n_frames + 1, device=frames.z.device) < frames.lengths[:, None]
+    later = inside_lengths(frames.lengths - 1, n_frames)
     means = past.mean + _mean_corrections(past, gains, later.mT, reach)
     log_weights = past.log_weights
     if not rule.by_frame:

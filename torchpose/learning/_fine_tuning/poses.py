@@ -11,6 +11,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchpose.camera._projection import join_arms
 from torchpose.errors import InputError, PriorError
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.learning._fine_tuning.parameters import (
     MEASURED,
@@ -50,8 +51,7 @@ class SequenceBatch(NamedTuple):
     @property
     def inside(self) -> Bool[Tensor, "B T"]:
         """Return True up to the length of each sequence."""
-        frames = torch.arange(self.poses.shape[1], device=self.lengths.device)
-        return frames < self.lengths[:, None]
+        return inside_lengths(self.lengths, self.poses.shape[1])
 
 
 def draw_sequences(

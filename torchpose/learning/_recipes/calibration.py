@@ -10,6 +10,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchpose._core.frame_rates import group_by_rate, same_rate
 from torchpose.errors import InputError
+from torchpose.filters._lengths import inside_lengths
 from torchpose.learning._training import DEFAULT_RATE, PoseSet, seen_keypoints
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.metrics._pose_errors import align
@@ -173,7 +174,7 @@ def _noisy_keypoints(
     generator = torch.Generator().manual_seed(seed + 1)
     lengths = torch.tensor([len(sequence) for sequence in sequences])
     poses = pad_sequence(sequences, batch_first=True).double()
-    inside = torch.arange(poses.shape[1]) < lengths[:, None]
+    inside = inside_lengths(lengths, poses.shape[1])
     keypoints = seen_keypoints(poses, prior.info, generator, view_share=_VIEWS, noise_std=_NOISE)
     keypoints[~inside] = torch.nan
     return keypoints, poses, inside

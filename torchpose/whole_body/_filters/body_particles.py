@@ -12,6 +12,7 @@ from torch import Tensor
 from torchpose._core.facade import set_up_facade
 from torchpose.body._kinematics import Body
 from torchpose.errors import DegenerateFilterWarning
+from torchpose.filters._lengths import held_past_lengths, inside_lengths
 from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._resampling import resample
@@ -169,23 +170,19 @@ def stack_outputs(
     details = {name: torch.stack([step.details[name] for step in steps], 1) for name in names}
     if lengths is None:
         return BodyFilterOutput(**parts, details=details)
-    frames = torch.arange(len(steps), device=lengths.device)
-    rows = torch.arange(len(lengths), device=lengths.device)[:, None]
-    held = torch.minimum(frames, lengths[:, None] - 1)
-    inside = frames < lengths[:, None]
-    parts = {name: value[rows, held] for name, value in parts.items()}
+    inside = inside_lengths(lengths, len(steps))
+    parts = {name: held_past_lengths(value, lengths) for name, value in parts.items()}
     parts["log_evidence"] = torch.where(inside, parts["log_evidence"], 0.0)
     parts["respread"] = parts["respread"] & inside
-    return BodyFilterOutput(
-        **parts, details={name: value[rows, held] for name, value in details.items()}
-    )
+    details = {name: held_past_lengths(value, lengths) for name, value in details.items()}
+    return BodyFilterOutput(**parts, details=details)
 
 
 def without_repeats(track: BodyFilterOutput, lengths: Int[Tensor, " B"] | None) -> BodyFilterOutput:
     """Return a track [B, T, ...] whose details are zero past the lengths, where they repeat the last ones."""
     if lengths is None:
         return track
-    past = torch.arange(track.mean.shape[1], device=lengths.device) >= lengths[:, None]
+    past = ~inside_lengths(lengths, track.mean.shape[1])
     details = {
         name: value.masked_fill(past.view(*past.shape, *[1] * (value.ndim - 2)), 0)
         for name, value in track.details.items()

@@ -21,6 +21,7 @@ from torchpose.body._feet import ANKLES, FEET
 from torchpose.body._kinematics import Body
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError, ShapeError
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._measurements import check_lengths
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._foot_prior import shipped_foot_prior
@@ -364,7 +365,7 @@ class KeypointBodyTracker(nn.Module):
 def _until(frames: KeypointFrame, lengths: Int[Tensor, " B"]) -> KeypointFrame:
     """Return frames [B, T, ...] to the end of the longest sequence, without keypoints past each one's own."""
     frames = part_of(frames, slice(0, int(lengths.max())))
-    inside = torch.arange(frames.inlier.shape[1], device=lengths.device) < lengths[:, None]
+    inside = inside_lengths(lengths, frames.inlier.shape[1])
     return frames._replace(inlier=frames.inlier * inside[:, :, None, None])
 
 
