@@ -17,6 +17,7 @@ from torchpose.whole_body._filters.legs import exchange_legs
 from torchpose.whole_body._filters.limb_observations import (
     count_positions,
     least_part_log_likelihood,
+    part_groups,
     part_log_likelihood,
     parts_log_weight,
 )
@@ -132,7 +133,8 @@ def test_hypotheses_weigh_as_the_product_over_parts_of_sums_over_places():
     covariance = filter_.conditionals.diffuse(mean, filter_.first_memory(after.particles)[0])[1]
     points = sigma_points(mean, covariance, centre=True)
     roots = torch.cat([after.particles[0, :, :6], mean.flatten(1)], -1)
-    counts = count_positions(body, roots, points, rig(), prepare_silhouettes(silhouettes[0]))
+    seen, groups = prepare_silhouettes(silhouettes[0]), part_groups(body.skeleton)
+    counts = count_positions(body, roots, points, rig(), seen, groups)
     pixels = part_log_likelihood(counts, cameras="sum").exp()
     product = torch.ones(12, dtype=torch.float64)
     for part in range(pixels.shape[1]):

@@ -3,11 +3,10 @@
 import pytest
 import torch
 
-from torchpose.errors import InputError
 from torchpose.whole_body import bidirectional
 from torchpose.whole_body._silhouettes.likelihood import (
+    LIKELIHOODS,
     intersection_over_union,
-    silhouette_log_likelihood,
 )
 from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
@@ -65,16 +64,8 @@ def test_best_and_worst():
     assert intersection_over_union(nothing).tolist() == [0.0]
 
 
-def test_sharpness_and_kinds():
+def test_overlap_is_a_log_likelihood():
     counts = counts_of(*images(2))
-    published = silhouette_log_likelihood(counts)
-    assert torch.equal(published, bidirectional(counts))
-    torch.testing.assert_close(silhouette_log_likelihood(counts, sharpness=20.0), 20 * published)
-    overlap = silhouette_log_likelihood(counts, "overlap", 3.0)
-    torch.testing.assert_close(overlap.exp(), intersection_over_union(counts) ** 3)
+    overlap = LIKELIHOODS["overlap"](counts)
+    torch.testing.assert_close(overlap.exp(), intersection_over_union(counts))
     assert float(overlap[2]) == -torch.inf
-    assert silhouette_log_likelihood(counts, "overlap", 0.0).tolist() == [0.0] * 6
-    with pytest.raises(InputError, match="bidirectional, overlap"):
-        silhouette_log_likelihood(counts, "chamfer")
-    with pytest.raises(InputError, match="sharpness"):
-        silhouette_log_likelihood(counts, sharpness=-1.0)

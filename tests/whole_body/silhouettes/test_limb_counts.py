@@ -53,16 +53,16 @@ def test_parts_weigh_as_the_union_of_their_limbs(chunk, batch_of_silhouettes, n_
     assert bool((result.weight < plain.weight).any())
 
 
-def test_shares_are_of_the_pixels_within_the_image():
+def test_pixels_count_within_the_image():
     rig = make_rig(1)
     parts = parts_of(1, 3, 2, seed=7)
     everywhere = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
     counts = count_parts(parts, None, rig, everywhere)
-    assert torch.equal(counts.share(), (counts.area > 0).double())
+    assert torch.equal(counts.weight, counts.area.double())
     behind = Limbs(parts.start - 100 * rig.rotation[0, 2], parts.end - 100 * rig.rotation[0, 2],
                    parts.radii)  # fmt: skip
     unseen = count_parts(behind, None, rig, everywhere)
-    assert not bool(unseen.area.any()) and not bool(unseen.share().any())
+    assert not bool(unseen.area.any()) and not bool(unseen.weight.any())
 
 
 def test_shapes_must_fit():

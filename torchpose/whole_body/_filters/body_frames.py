@@ -14,7 +14,7 @@ from torchpose.whole_body._keypoints.particle_likelihood import (
     KeypointMeasurement,
     keypoint_log_likelihood,
 )
-from torchpose.whole_body._silhouettes.likelihood import silhouette_log_likelihood
+from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 from torchpose.whole_body._silhouettes.rendering import (
     PreparedSilhouettes,
     count_pixels,
@@ -58,12 +58,11 @@ def silhouette_score(
         silhouettes: [B, C, H, W]. cameras: the C cameras. likelihood: "bidirectional" or "overlap".
         limb_shape: "cylinders" or "rectangles".
     """
-    if not isinstance(silhouettes, PreparedSilhouettes):
-        silhouettes = prepare_silhouettes(silhouettes)
+    prepared = prepare_silhouettes(silhouettes)
 
     def score(states: Tensor) -> Tensor:
-        counts = count_pixels(body, states, cameras, silhouettes, limb_shape=limb_shape)
-        return silhouette_log_likelihood(counts, likelihood)
+        counts = count_pixels(body, states, cameras, prepared, limb_shape=limb_shape)
+        return LIKELIHOODS[likelihood](counts)
 
     return score
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_positive, check_shape
+from torchpose._core.checks import check_choice, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.body._limbs import Limbs
 from torchpose.body._skeleton import BodySkeleton, other_side
@@ -116,7 +116,7 @@ def count_positions(
     points: Float[Tensor, "*batch V S 3"],
     cameras: Cameras,
     silhouettes: PreparedSilhouettes,
-    groups: tuple[PartGroup, ...] | None = None,
+    groups: tuple[PartGroup, ...],
 ) -> PartCounts:
     """Count silhouette pixels under every part at every sigma point, 1/2 where the opposing part may be.
 
@@ -129,7 +129,6 @@ def count_positions(
 
     Reference: Daubney & Xie, equation (4).
     """
-    groups = part_groups(body.skeleton) if groups is None else groups
     weights, areas = [], []
     for group in groups:
         limbs = part_positions(body, states, points, group)
@@ -151,11 +150,10 @@ def part_log_likelihood(
     *,
     normalisation: str = "published",
     cameras: str = "product",
-    sharpness: float = 1.0,
 ) -> Float[Tensor, "*batch V S"]:
     """Return log p(O_i | sigma_s), of all cameras together.
 
-    p = (prod_c v_c)^k or (sum_c v_c)^k,   v_c the pixels (DX 4), or their share of the part's own
+    p = prod_c v_c or sum_c v_c,   v_c the pixels (DX 4), or their share of the part's own
 
     The paper does not say how cameras combine; "product" takes them as independent.
 
@@ -163,15 +161,14 @@ def part_log_likelihood(
         counts: [..., V, S, C]. normalisation: "published" (pixels), or "share", which no scale of the
             image changes. cameras: "product", each factor at least a hundredth of the part's pixels
             in view (one camera alone rules nothing out), or "sum".
-        sharpness: k; 1 is the published form.
 
     Returns:
         [..., V, S], float64, -inf for a place that no camera sees any silhouette under.
 
     Raises:
-        InputError: another rule, or a sharpness that is not positive.
+        InputError: another rule.
     """
-    check_rules(normalisation, cameras, sharpness)
+    check_rules(normalisation, cameras)
     area = counts.area.clamp_min(1).double()
     pixels = counts.weight
     if cameras == "product":
@@ -180,7 +177,7 @@ def part_log_likelihood(
         value = torch.where((pixels > 0).any(-1), value, -math.inf)
     else:
         value = (pixels if normalisation == "published" else pixels / area).sum(-1).log()
-    return sharpness * value
+    return value
 
 
 def least_part_log_likelihood(
@@ -244,11 +241,10 @@ def observation_gaussians(
     return new_mean, floor_eigenvalues(new_covariance, least_std**2)
 
 
-def check_rules(normalisation: str, cameras: str, sharpness: float) -> None:
-    """Raise `InputError` unless both rules are known and the sharpness is positive."""
+def check_rules(normalisation: str, cameras: str) -> None:
+    """Raise `InputError` unless both rules are known."""
     check_choice("normalisation", normalisation, NORMALISATIONS)
     check_choice("cameras", cameras, CAMERA_RULES)
-    check_positive("sharpness", sharpness)
 
 
 # --- helpers --------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose._core.checks import check_choice, check_shape
+from torchpose._core.checks import check_choice, check_positive, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators, standard_normal
@@ -144,7 +144,8 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         **options: Unpack[BodyFilterOptions],
     ) -> None:
         _check(body, options.get("likelihood"), weighting, least_std, first_std)
-        check_rules(normalisation, camera_rule, observation_sharpness)
+        check_rules(normalisation, camera_rule)
+        check_positive("observation_sharpness", observation_sharpness)
         conditionals.check_for(body)
         options.setdefault("estimate", "map")
         options.setdefault("limit_mode", "discard")

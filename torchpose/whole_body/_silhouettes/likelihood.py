@@ -4,12 +4,9 @@ As printed both are nearly flat: -log p lies in [0, 2] for the bidirectional one
 particles differ by at most e^2. A sharpness of 1 is the published form.
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_choice
-from torchpose.errors import InputError
 from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
 
@@ -28,6 +25,7 @@ def bidirectional(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
 
     Reference: manifold-regularised particle filter, equation (12).
 
+    >>> import torch
     >>> one = torch.tensor([[10, 20]])
     >>> bidirectional(SilhouetteCounts(one, torch.tensor([[5, 20]]), one)).tolist()
     [-0.5]
@@ -54,6 +52,7 @@ def intersection_over_union(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]
 
     Reference: aSpace posture constraints, equation (7).
 
+    >>> import torch
     >>> ten = torch.tensor([10])
     >>> float(intersection_over_union(SilhouetteCounts(ten, torch.tensor([5]), ten)))
     0.333...
@@ -62,34 +61,9 @@ def intersection_over_union(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]
     return (overlap / (model + image - overlap).clamp_min(1)).mean(-1)
 
 
-def silhouette_log_likelihood(
-    counts: SilhouetteCounts, kind: str = "bidirectional", sharpness: float = 1.0
-) -> Float[Tensor, "*batch"]:
-    """Return sharpness times the log-likelihood of the named kind.
-
-    Args:
-        counts: the counts of C cameras, each [..., C].
-        kind: "bidirectional" (MR 12), or "overlap": log of the intersection over union (AS 7),
-            -inf without any overlap.
-        sharpness: exponent of the likelihood, 0 or more; 1 is the published form.
-
-    Returns:
-        [...], float64.
-
-    Raises:
-        InputError: another kind, or a negative sharpness.
-    """
-    check_choice("likelihood", kind, LIKELIHOODS)
-    if not 0 <= sharpness < float("inf"):
-        raise InputError(f"sharpness must be 0 or more and finite, got {sharpness}")
-    if sharpness == 0:
-        return torch.zeros(counts.model.shape[:-1], dtype=torch.float64).to(counts.model.device)
-    return sharpness * LIKELIHOODS[kind](counts)
-
-
 def _log_overlap(counts: SilhouetteCounts) -> Tensor:
     return intersection_over_union(counts).log()
 
 
 LIKELIHOODS = {"bidirectional": bidirectional, "overlap": _log_overlap}
-"""Log-likelihoods by name."""
+"""Log-likelihoods by name: (MR 12), and the log of (AS 7), which is -inf without any overlap."""

@@ -34,13 +34,6 @@ class PartCounts(NamedTuple):
     weight: Float[Tensor, "*batch S C"]
     area: Int[Tensor, "*batch S C"]
 
-    def share(self) -> Float[Tensor, "*batch S C"]:
-        """Return the weight as a share of the part's own pixels, which no scale of the image changes.
-
-        0 where the part is out of sight.
-        """
-        return self.weight / self.area.clamp_min(1)
-
 
 def count_parts(
     parts: Limbs,
@@ -77,8 +70,7 @@ def count_parts(
     Reference: Daubney & Xie, section 5 and equation (4).
     """
     rig, parts = as_rig(cameras), _positions("parts", parts)
-    if not isinstance(silhouettes, PreparedSilhouettes):
-        silhouettes = prepare_silhouettes(silhouettes)
+    silhouettes = prepare_silhouettes(silhouettes)
     rig.check_images("silhouettes", silhouettes.shape)
     batch, n_positions = tuple(parts.start.shape[:-3]), parts.start.shape[-3]
     n, strip = math.prod(batch), Strip(*silhouettes.shape)

@@ -82,15 +82,17 @@ class PreparedSilhouettes(NamedTuple):
         return leading
 
 
-def prepare_silhouettes(silhouettes: Tensor) -> PreparedSilhouettes:
+def prepare_silhouettes(silhouettes: Tensor | PreparedSilhouettes) -> PreparedSilhouettes:
     """Return running sums of silhouettes along their rows.
 
     Args:
-        silhouettes: [*B, C, H, W], True (or not zero) on the person.
+        silhouettes: [*B, C, H, W], True (or not zero) on the person; what is prepared stays as it is.
 
     Raises:
         ShapeError: fewer than three dimensions, or an image without pixels.
     """
+    if isinstance(silhouettes, PreparedSilhouettes):
+        return silhouettes
     if silhouettes.ndim < 3 or 0 in silhouettes.shape[-3:]:
         raise ShapeError(
             f"silhouettes must have shape [..., C, H, W], got {list(silhouettes.shape)}"
@@ -139,8 +141,7 @@ def count_pixels(
     """
     check_limb_shape(limb_shape)
     rig, limbs = as_rig(cameras), _limbs_of(body, state, near)
-    if not isinstance(silhouettes, PreparedSilhouettes):
-        silhouettes = prepare_silhouettes(silhouettes)
+    silhouettes = prepare_silhouettes(silhouettes)
     rig.check_images("silhouettes", silhouettes.shape)
     batch = tuple(limbs.start.shape[:-2])
     shared = silhouettes.leading(batch, "states")
