@@ -124,18 +124,28 @@ def outline(limbs: ProjectedLimbs, height: int, width: int) -> Outlines:
         slope = run / rise.masked_fill(level, math.inf)
         sum_r = ra + rb
         edges += [(ay + by + sum_r * ny) * 0.5, half, (ax + bx + sum_r * nx) * 0.5, slope]
-    discs = [ax, ay, ra * ra, bx, by, rb * rb]
-    first = torch.minimum(ay - ra, by - rb).ceil().clamp_(0, height)
-    last = torch.maximum(ay + ra, by + rb).floor().clamp_(-1, height - 1)
-    right, left = torch.maximum(ax + ra, bx + rb), torch.minimum(ax - ra, bx - rb)
-    seen = limbs.visible & (right >= 0.0) & (left <= width - 1)
-    rows = (last - first + 1.0).clamp_min_(0).where(seen, 0.0)
-    return Outlines(
-        torch.stack(discs).view(2, 3, -1),
-        torch.stack(edges).view(2, 4, -1),
-        first.reshape(-1),
-        rows.reshape(-1).long(),
-    )
+    discs = torch.stack([ax, ay, ra * ra, bx, by, rb * rb]).view(2, 3, -1)
+    left, right = torch.minimum(ax - ra, bx - rb), torch.maximum(ax + ra, bx + rb)
+    top, bottom = torch.minimum(ay - ra, by - rb), torch.maximum(ay + ra, by + rb)
+    rows = _rows(limbs.visible, left, right, top, bottom, height, width)
+    return Outlines(discs, torch.stack(edges).view(2, 4, -1), *rows)
+
+
+def _rows(
+    visible: Tensor,
+    left: Tensor,
+    right: Tensor,
+    top: Tensor,
+    bottom: Tensor,
+    height: int,
+    width: int,
+) -> tuple[Float[Tensor, " M"], Int[Tensor, " M"]]:
+    """Return the first row that limbs cover, and how many, of those that reach into the image."""
+    first = top.ceil().clamp_(0, height)
+    last = bottom.floor().clamp_(-1, height - 1)
+    seen = visible & (right >= 0) & (left <= width - 1)
+    rows = (last - first + 1).clamp_min_(0).where(seen, 0.0)
+    return first.reshape(-1), rows.reshape(-1).long()
 
 
 def _clip(homogeneous: Tensor, radii: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -346,15 +356,11 @@ def outline_rectangles(limbs: ProjectedLimbs, height: int, width: int) -> Outlin
         *_edge(middle, across, along, 1), *_edge(middle, across, along, -1),
         *_edge(middle, along, across, 1), *_edge(middle, along, across, -1),
     ]  # fmt: skip
-    reach_x, reach_y = (a.abs() + b.abs() for a, b in zip(along, across, strict=True))
-    first = (middle[1] - reach_y).ceil().clamp_(0, height)
-    last = (middle[1] + reach_y).floor().clamp_(-1, height - 1)
-    seen = limbs.visible & (middle[0] + reach_x >= 0) & (middle[0] - reach_x <= width - 1)
-    rows = (last - first + 1).clamp_min_(0).where(seen, 0.0)
+    (x, y), reach = middle, [a.abs() + b.abs() for a, b in zip(along, across, strict=True)]
+    left, right, top, bottom = x - reach[0], x + reach[0], y - reach[1], y + reach[1]
+    rows = _rows(limbs.visible, left, right, top, bottom, height, width)
     table = torch.stack(edges).view(4, 4, -1)
-    return Outlines(
-        table.new_empty(0, 3, table.shape[-1]), table, first.reshape(-1), rows.reshape(-1).long()
-    )
+    return Outlines(table.new_empty(0, 3, table.shape[-1]), table, *rows)
 
 
 Vector = tuple[Tensor, Tensor]
