@@ -22,6 +22,7 @@ from torch import Tensor
 from torchpose.camera._rig import CameraRig
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.whole_body._keypoints.joint_elimination import JOINT_STD, eliminated
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     LEAST_DEPTH,
     NOISE_SCALES,
@@ -40,7 +41,6 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
 N_ERRORS = 7  # of a camera: rotation, shift, delay
 ROTATION_STD, SHIFT_STD = 0.0175, 0.03  # radians, metres
 _EXCHANGED = -3.5  # prior log-odds of exchanged sides
-_JOINT_STD = 5.0  # metres, of joints about where tracking has them; tells where no two cameras do
 
 
 class CameraErrors(NamedTuple):
@@ -201,13 +201,11 @@ def _equations(
     E = (A[:, cameras].mT @ B).permute(0, 2, 3, 1, 4).flatten(-2)
     g = (r[:, cameras, ..., None, :] @ B).squeeze(-2).transpose(1, 2).flatten(-2)
     A, r = A.transpose(1, 2).flatten(2, 3), r.transpose(1, 2).flatten(2)[..., None]
-    b = A.mT @ r + (given.joints - joints)[..., None] / _JOINT_STD**2
-    chol = torch.linalg.cholesky(A.mT @ A + torch.eye(3).to(A) / _JOINT_STD**2)
-    solved = torch.linalg.solve_triangular(chol, torch.cat([E, b], -1), upper=False)
-    X, y = solved[..., :-1], solved[..., -1:]
-    B, X_rows = B.transpose(0, 1).flatten(1, 3), X.flatten(0, 2)
-    S = torch.block_diag(*(B.mT @ B)) + torch.diag(prior) - X_rows.T @ X_rows
-    return _Equations(chol, E, b, S, g - (X.mT @ y).squeeze(-1))
+    b = A.mT @ r + (given.joints - joints)[..., None] / JOINT_STD**2
+    chol, Y, y = eliminated(A, E, b)
+    B, rows = B.transpose(0, 1).flatten(1, 3), Y.flatten(0, 2)
+    S = torch.block_diag(*(B.mT @ B)) + torch.diag(prior) - rows.T @ rows
+    return _Equations(chol, E, b, S, g - (Y.mT @ y).squeeze(-1))
 
 
 def by_pose(rig: CameraRig, joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T C J 2 6"]:

@@ -23,6 +23,7 @@ from torch import Tensor
 from torchpose.camera._rig import CameraRig
 from torchpose.math._gaussian import symmetrise
 from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.whole_body._keypoints.joint_elimination import eliminated
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate_without
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     LEAST_DEPTH,
@@ -39,7 +40,6 @@ _STD = (*[0.1] * 3, *[0.03] * 3, 0.1, 0.15)  # radians, metres, log of a factor,
 _KNOWN = 1e12  # information about errors that are not free
 _FREEDOM = 4.0  # nu, of Student's distribution of the errors
 _WIDTHS = (100.0, 30.0, 10.0, 4.0, 2.0, *[1.0] * 5)
-_JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cameras do
 _WIDEST = 1.0  # square of a ray's tangent from which on the lens distorts no more
 _BEHIND = 1e6  # square of the error of a keypoint whose joint is behind the camera
 
@@ -220,9 +220,7 @@ def _equations(
     B = root * torch.cat([by_turn, own, by_focal, by_lens], -1)
     E = A_own.mT @ B
     b = (A.mT @ r[..., None]).sum(2)
-    chol = torch.linalg.cholesky((A.mT @ A).sum(2) + torch.eye(3).to(A) / _JOINT_STD**2)
-    solved = torch.linalg.solve_triangular(chol, torch.cat([E, b], -1), upper=False)
-    Y, y = solved[..., :-1], solved[..., -1:]
+    chol, Y, y = eliminated(A.transpose(2, 3).flatten(3, 4), E, b)
     S = (B.mT @ B - Y.mT @ Y).sum((1, 2))
     g = (B.mT @ r_own[..., None] - Y.mT @ y).sum((1, 2)).squeeze(-1)
     return _Equations(chol, E, b, S, g)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchpose.math._gaussian import block_diagonal, symmetrise
 from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
+from torchpose.whole_body._keypoints.joint_elimination import eliminated
 from torchpose.whole_body._keypoints.joint_triangulation import (
     triangulate_all,
     triangulate_without,
@@ -36,7 +37,6 @@ _WIDTHS = (400.0, 400.0, 100.0, 100.0, 25.0, 25.0, 9.0, 4.0, 2.0, *[1.0] * 6)
 _WIDTHS_OF_KNOWN = (9.0, 4.0, 1.0, 1.0)
 _KNOWN = 1e12  # per square radian, the information about cameras that are not turned
 _LEAST_DEPTH = 0.1  # of a turned ray, whose depth is 1 before it is turned
-_JOINT_STD = 5.0  # metres, of a joint about where it is; tells where no two cameras do
 
 
 class Turns(NamedTuple):
@@ -156,10 +156,9 @@ def _equations(
     T = root[..., None] * torch.linalg.cross(rays[..., None, :], by_ray)
     F = (A.mT @ T).movedim(1, -2).flatten(-2)
     A, T = A.transpose(1, 2).flatten(2, 3), T.flatten(2, 3)
-    chol = torch.linalg.cholesky(A.mT @ A + torch.eye(3).to(A) / _JOINT_STD**2)
     b = A.mT @ r.transpose(1, 2).flatten(2)[..., None]
-    solved = torch.linalg.solve_triangular(chol, torch.cat([F, b], -1), upper=False).flatten(1, 2)
-    Y, y = solved[..., :-1], solved[..., -1:]
+    chol, *solved = eliminated(A, F, b)
+    Y, y = (value.flatten(1, 2) for value in solved)
     S = block_diagonal(T.mT @ T) - Y.mT @ Y
     g = (T.mT @ r.flatten(2)[..., None]).flatten(1) - (Y.mT @ y).squeeze(-1)
     return chol, F, b, S, g
