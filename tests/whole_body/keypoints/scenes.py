@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.whole_body import BodyTrack, BodyTracker
 
 FPS = 30.0
 NAMES = BODY_15.names
@@ -68,11 +69,28 @@ def scene(
     cameras: int = 4, n_frames: int = 40, noise: float = 4.0, seed: int = 0, height: float = 1.7
 ) -> Scene:
     """A moving body with noise of some pixels."""
-    joints, rig = moving_body(n_frames, height), ring(cameras)
-    generator = torch.Generator().manual_seed(seed)
-    pixels = rig(joints).pixels
-    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    return seen_by(ring(cameras), moving_body(n_frames, height), noise, seed)
+
+
+def seen_by(rig: CameraRig, joints: Tensor, noise: float = 4.0, seed: int = 0) -> Scene:
+    """Joints with noise of some pixels."""
+    pixels = noisy(rig(joints).pixels, noise, seed)
     return Scene(joints, rig, pixels, torch.full_like(pixels[..., 0], 0.9))
+
+
+def noisy(pixels: Tensor, noise: float = 4.0, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+
+
+def kalman(rig, **options) -> BodyTracker:
+    return BodyTracker(rig, "kalman", fps=FPS, **options)
+
+
+def track(given: Scene, smoothing: str = "none", **options) -> BodyTrack:
+    return kalman(given.rig, **options)(
+        keypoints=given.keypoints, confidence=given.confidence, smoothing=smoothing
+    )
 
 
 def errors(track, joints: Tensor) -> Tensor:

@@ -6,8 +6,7 @@ import math
 import pytest
 import torch
 
-from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, scene
-from torchpose import BodyTracker
+from tests.whole_body.keypoints.scenes import FPS, NAMES, kalman, moving_body, scene, seen_by
 from torchpose.camera import CameraRig
 from torchpose.camera._lens import distort_rays
 from torchpose.errors import CameraError
@@ -48,10 +47,7 @@ def wide():
     turn = rotvec_to_matrix(torch.tensor([0.12, 0.42, 0.0], dtype=torch.float64))
     rig.rotation.copy_(turn @ rig.rotation)
     rig.translation.copy_((turn @ rig.translation[..., None]).squeeze(-1))
-    generator = torch.Generator().manual_seed(0)
-    pixels = rig(found.joints).pixels
-    pixels = pixels + 4 * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
-    return found._replace(rig=rig, keypoints=pixels)
+    return seen_by(rig, found.joints)
 
 
 def frames_of(rig: CameraRig, keypoints) -> KeypointFrame:
@@ -103,14 +99,11 @@ def test_a_wrong_focal_length_of_one_camera_is_found(factor, cameras):
 
 
 def test_a_wrong_focal_length_is_said_by_the_track(three):
-    tracker = BodyTracker(with_focal(three.rig, 0.85), "kalman", fps=FPS)
-    note = tracker(keypoints=three.keypoints, names=NAMES).notes[0]
+    tracker = kalman(with_focal(three.rig, 0.85))
+    note = tracker(keypoints=three.keypoints).notes[0]
     assert note.startswith("camera c1: cameras agree far better if its focal length is 1.1")
     assert "in place of 1105" in note
-    assert (
-        BodyTracker(three.rig, "kalman", fps=FPS)(keypoints=three.keypoints, names=NAMES).notes
-        == ()
-    )
+    assert kalman(three.rig)(keypoints=three.keypoints).notes == ()
 
 
 def test_a_lens_that_is_missing_is_found(wide):
@@ -163,7 +156,7 @@ def test_a_pose_of_another_convention_of_one_camera_is_said(word, change, camera
     one = scene(cameras, n_frames=7)
     rig = with_pose(one.rig, change)
     try:
-        notes = BodyTracker(rig, "kalman", fps=FPS)(keypoints=one.keypoints, names=NAMES).notes
+        notes = kalman(rig)(keypoints=one.keypoints).notes
     except CameraError:
         assert cameras == 2  # both may agree by another convention, too
         return
@@ -179,7 +172,7 @@ FLIP_UP = torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
 def test_two_cameras_that_agree_poorly_are_said():
     two = scene(2, n_frames=20)
     for rig in (with_focal(two.rig, 0.85), turned(two.rig, 1.5)):
-        notes = BodyTracker(rig, "kalman", fps=FPS)(keypoints=two.keypoints, names=NAMES).notes
+        notes = kalman(rig)(keypoints=two.keypoints).notes
         (note,) = (note for note in notes if "agree poorly" in note)
         assert "cameras c0 and c1" in note and "pixels or more" in note and "late" in note
         assert not any("calibrated pose of this or of another" in other for other in notes)

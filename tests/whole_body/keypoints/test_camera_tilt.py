@@ -7,8 +7,7 @@ import math
 import pytest
 import torch
 
-import torchpose
-from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body
+from tests.whole_body.keypoints.scenes import kalman, moving_body
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import InputError
@@ -42,8 +41,8 @@ def seen_by(camera: PinholeCamera, aimed: bool = False) -> torch.Tensor:
 
 
 def tracked(pixels: torch.Tensor, camera: PinholeCamera, up: str | None = None) -> BodyTrack:
-    tracker = torchpose.BodyTracker([camera], "kalman", fps=FPS, up=up)
-    return tracker(keypoints=pixels, names=NAMES)
+    tracker = kalman([camera], up=up)
+    return tracker(keypoints=pixels)
 
 
 @functools.cache
@@ -113,10 +112,10 @@ def test_who_hides_the_legs_or_sits_tells_nothing():
 
 def test_a_tracker_finds_the_tilt_of_its_only_camera():
     camera = camera_of()
-    tracker = torchpose.BodyTracker([camera], "kalman", fps=FPS)
+    tracker = kalman([camera])
     track = standing_before(12.0)
     assert isinstance(found := tracker.find_tilt([track]), CameraTilt)
     assert found == find_camera_tilt([track], CameraRig([camera]))
     assert tracker.find_tilt([]) is None
     with pytest.raises(InputError, match="without `up`"):
-        torchpose.BodyTracker([camera], "kalman", fps=FPS, up="y").find_tilt([track])
+        kalman([camera], up="y").find_tilt([track])

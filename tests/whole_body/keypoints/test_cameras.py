@@ -12,9 +12,12 @@ from tests.whole_body.keypoints.scenes import (
     Scene,
     camera_at,
     errors,
+    kalman,
     moving_body,
+    noisy,
     ring,
     scene,
+    seen_by,
 )
 from torchpose.camera import CameraRig
 from torchpose.errors import CameraError, InputError, ShapeError
@@ -32,11 +35,10 @@ SHIFT = (-0.5, 0.5, 0.7)
 
 def filmed(delays=(0.0, 0.0, 0.0), noise: float = 3.0, seed: int = 0) -> Scene:
     """A person in cameras that began too early by so many frames."""
-    generator = torch.Generator().manual_seed(seed)
     rig = ring(len(delays))
     seen = [moving_body(T, phase=-delay / FPS) for delay in delays]
     pixels = torch.stack([rig(j).pixels[:, c] for c, j in enumerate(seen)], 1)
-    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    pixels = noisy(pixels, noise, seed)
     return Scene(seen[0], rig, pixels, torch.full_like(pixels[..., 0], 0.9))
 
 
@@ -48,8 +50,7 @@ def disturbed(rig: CameraRig, camera: int, degrees: float, metres: float) -> Cam
 
 
 def track(given: Scene, rig=None, **options):
-    tracker = BodyTracker(given.rig if rig is None else rig, "kalman", fps=FPS)
-    return tracker(
+    return kalman(given.rig if rig is None else rig)(
         keypoints=given.keypoints, confidence=given.confidence, smoothing="full", **options
     )
 
@@ -247,7 +248,7 @@ def test_a_refined_track_is_saved_and_read(in_step, tmp_path):
 
 @pytest.mark.usefixtures("undoubted_here")
 def test_a_single_frame_and_a_blind_camera_leave_cameras_as_given(right):
-    tracker = BodyTracker(right.rig, "kalman", fps=FPS)
+    tracker = kalman(right.rig)
     one = tracker(keypoints=right.keypoints[:1], refine="both")
     assert any("cameras as given" in note for note in one.notes)
     blind = right.keypoints[:3].clone()
@@ -258,10 +259,10 @@ def test_a_single_frame_and_a_blind_camera_leave_cameras_as_given(right):
 
 
 def test_what_cannot_be_refined_is_refused(right):
-    one = BodyTracker(right.rig.select([0]), "kalman", fps=FPS)
+    one = kalman(right.rig.select([0]))
     with pytest.raises(InputError, match="needs two or more, got one"):
         one(keypoints=right.keypoints[:, :1], refine="both")
-    several = BodyTracker(right.rig, "kalman", fps=FPS)
+    several = kalman(right.rig)
     with pytest.raises(ShapeError, match="one recording"):
         several(keypoints=right.keypoints[None], refine="both")
     with pytest.raises(InputError, match="refine"):
@@ -293,7 +294,7 @@ def scaled(rig, factor):
 @pytest.mark.parametrize("factor", [40.0, 3.28, 0.1])  # within 200 m, in feet, of no scale
 def test_cameras_in_other_units_are_refused_with_their_factor(factor):
     given = scene(2, 10, noise=6.0)
-    tracker = BodyTracker(scaled(given.rig, factor), "kalman", fps=FPS)
+    tracker = kalman(scaled(given.rig, factor))
     with pytest.raises(CameraError, match="in metres, but with these cameras") as told:
         tracker(keypoints=given.keypoints)
     found = float(re.search(r"about (\S+) times", str(told.value))[1])
@@ -315,7 +316,4 @@ def test_cameras_in_feet_are_refused_by_particles_and_for_several_persons(method
 )
 def test_small_and_tall_people_and_cameras_side_by_side_are_in_metres(height, distance, apart):
     rig = CameraRig([camera_at(0.6 + i * apart, distance, f"c{i}") for i in range(2)])
-    pixels = rig(moving_body(6, height)).pixels
-    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).to(pixels)
-    tracker = BodyTracker(rig, "kalman", fps=FPS)
-    assert len(tracker(keypoints=pixels + 3 * noise)) == 6
+    assert len(track(seen_by(rig, moving_body(6, height), 3.0))) == 6

@@ -5,8 +5,15 @@ import copy
 import pytest
 import torch
 
-from tests.whole_body.keypoints.scenes import FPS, NAMES, camera_at, moving_body, ring, scene
-from torchpose import BodyTracker
+from tests.whole_body.keypoints.scenes import (
+    FPS,
+    NAMES,
+    camera_at,
+    kalman,
+    moving_body,
+    ring,
+    scene,
+)
 from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
 from torchpose.math._rotations import matrix_to_rotvec, rotvec_to_matrix
@@ -52,8 +59,8 @@ def seen():
 
 
 def track(rig, keypoints, up=None, **options):
-    tracker = BodyTracker(rig, "kalman", fps=FPS, up=up)
-    return tracker(keypoints=keypoints, names=NAMES, **options)
+    tracker = kalman(rig, up=up)
+    return tracker(keypoints=keypoints, **options)
 
 
 @pytest.mark.parametrize(
@@ -135,10 +142,10 @@ def test_a_person_upside_down_in_one_camera_is_said():
 @pytest.mark.parametrize("cameras", [2, 3])
 def test_a_live_stream_is_refused_at_its_beginning(seen, cameras):
     rig = rig_of_poses(seen.rig.select(range(cameras)), POSES["from camera to world"])
-    tracker = BodyTracker(rig, "kalman", fps=FPS)
+    tracker = kalman(rig)
     with pytest.raises(CameraError, match="from camera to world"):
         tracker.step(tracker.init(names=NAMES), keypoints=seen.keypoints[0, :cameras])
-    tracker = BodyTracker(seen.rig, "kalman", fps=FPS)
+    tracker = kalman(seen.rig)
     state, _ = tracker.step(tracker.init(names=NAMES), keypoints=seen.keypoints[0])
     upside_down = torch.stack(PIXELS["upside down"](*seen.keypoints[1].unbind(-1)), -1)
     tracker.step(state, keypoints=upside_down)  # one frame of a stream that has begun stops nothing

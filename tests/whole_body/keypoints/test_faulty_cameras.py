@@ -11,11 +11,11 @@ from tests.whole_body.keypoints.scenes import (
     NAMES,
     camera_at,
     errors,
+    kalman,
     moving_body,
     ring,
     scene,
 )
-from torchpose import BodyTracker
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 from torchpose.errors import CameraError
@@ -61,7 +61,7 @@ def three():
 
 
 def track(keypoints, rig):
-    return BodyTracker(rig, "kalman", fps=FPS)(keypoints=keypoints, names=NAMES)
+    return kalman(rig)(keypoints=keypoints)
 
 
 def with_turn(rig: CameraRig, camera: int, degrees: float) -> CameraRig:
@@ -113,7 +113,7 @@ def turned_scene(three, degrees):
     rig = three.rig
     for camera, angle in enumerate(degrees):
         rig = with_turn(rig, camera, angle)
-    filter = BodyTracker(rig, "kalman", fps=FPS).by_keypoints.tracker.filter
+    filter = kalman(rig).by_keypoints.tracker.filter
     return rig, filter, [frame_of(keypoints) for keypoints in three.keypoints]
 
 
@@ -205,11 +205,11 @@ def test_cameras_that_turn_out_to_be_right_are_no_longer_turned_back(three):
 
 
 def test_live_steps_say_which_cameras_are_wrong(three):
-    tracker = BodyTracker(with_turn(three.rig, 1, 5.0), "kalman", fps=FPS)
+    tracker = kalman(with_turn(three.rig, 1, 5.0))
     _, found = tracker.step(tracker.init(names=NAMES), keypoints=three.keypoints[0])
     (note,) = found.notes
     assert "camera c1 (by" in note and "are turned back" in note
-    tracker = BodyTracker(three.rig, "kalman", fps=FPS)
+    tracker = kalman(three.rig)
     stream = tracker.init(names=NAMES)
     still = three.keypoints[:1].expand_as(three.keypoints).clone()
     still[:, :2] = three.keypoints[:, :2]
@@ -239,7 +239,7 @@ def test_a_camera_that_stands_still_is_not_used(three):
     two = track(three.keypoints[:14, :2], three.rig.select([0, 1]))
     assert float(errors(found, joints)[10:].mean()) < 1.2 * float(errors(two, joints)[10:].mean())
     assert float(found.details["inlier"][9:, 2].max()) == 0.0
-    tracker = BodyTracker(three.rig, "kalman", fps=FPS)
+    tracker = kalman(three.rig)
     stream = tracker.init(names=NAMES)
     for t in range(12):
         stream, live = tracker.step(stream, keypoints=keypoints[t])
@@ -253,8 +253,8 @@ def test_what_is_refined_leaves_wrong_cameras_out():
     keypoints = seen.keypoints.clone()
     keypoints[4:, 2] = keypoints[4, 2]
     keypoints[:, 3] = 400.0 + 0.5 * seen.keypoints[:, 1].flip(1)
-    tracker = BodyTracker(seen.rig, "kalman", fps=FPS)
-    found = tracker(keypoints=keypoints, names=NAMES, refine="extrinsics")
+    tracker = kalman(seen.rig)
+    found = tracker(keypoints=keypoints, refine="extrinsics")
     assert float(found.details["inlier"][5:, 2].max()) == 0.0
     assert float(found.details["inlier"][:, 3].max()) == 0.0
     assert float(errors(found, seen.joints).mean()) < 0.02
@@ -265,8 +265,8 @@ def test_what_is_refined_leaves_wrong_cameras_out():
 @pytest.mark.usefixtures("undoubted_here")
 def test_what_is_refined_begins_with_the_turns_that_tracking_finds(three):
     said = with_turn(three.rig, 1, 6.0)
-    tracker = BodyTracker(said, "kalman", fps=FPS)
-    found = tracker(keypoints=three.keypoints[:14], names=NAMES, refine="extrinsics")
+    tracker = kalman(said)
+    found = tracker(keypoints=three.keypoints[:14], refine="extrinsics")
     assert float(errors(found, three.joints[:14]).mean()) < 0.02
     rotation = rotvec_to_matrix(found.details["camera_rotation"][0])
     off = torch.rad2deg(angles_of(rotation @ three.rig.rotation.mT))
@@ -378,7 +378,7 @@ def test_one_camera_with_images_of_another_size_is_said(three):
 
 
 def test_right_and_turned_cameras_are_not_called_mirrored(three):
-    filter = BodyTracker(three.rig, "kalman", fps=FPS).by_keypoints.tracker.filter
+    filter = kalman(three.rig).by_keypoints.tracker.filter
     sides = filter.exchange.mirror
     behind = three.keypoints.clone()
     behind[::4, 1] = behind[::4, 1, sides]  # sides that a detector exchanges
@@ -402,6 +402,6 @@ def test_a_rolled_camera_by_itself_is_said():
 def test_several_persons_in_cameras_in_other_units_are_refused(three):
     far = ring(3)
     far.translation.mul_(15)
-    tracker = BodyTracker(far, "kalman", fps=FPS)
+    tracker = kalman(far)
     with pytest.raises(CameraError, match="metres"):
-        tracker(keypoints=three.keypoints[:, :, None], names=NAMES, persons="all")
+        tracker(keypoints=three.keypoints[:, :, None], persons="all")

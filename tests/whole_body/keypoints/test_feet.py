@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.whole_body.keypoints.scenes import FPS, NAMES, ring, scene
-from torchpose import BodyTracker
+from tests.whole_body.keypoints.scenes import FPS, NAMES, kalman, noisy, ring, scene
 from torchpose.body import BODY_15
 from torchpose.body._articulation import Articulation, BodyPoint, mirror_of
 from torchpose.body._feet import ANKLES, FEET, foot_points, foot_shape
@@ -43,9 +42,7 @@ def with_feet(cameras=4, n_frames=24, noise=4.0, seed=0):
     """A scene, its feet, and keypoints [T, C, 21, 2] of joints and feet with noise."""
     shown = scene(cameras, n_frames, noise, seed)
     feet = standing_feet(shown.joints)
-    generator = torch.Generator().manual_seed(seed + 1)
-    pixels = shown.rig(feet).pixels
-    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    pixels = noisy(shown.rig(feet).pixels, noise, seed + 1)
     return shown, feet, torch.cat([shown.keypoints, pixels], 2)
 
 
@@ -57,7 +54,7 @@ def four():
 @pytest.fixture(scope="module")
 def tracked(four):
     shown, _, keypoints = four
-    return BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=keypoints, names=WITH_FEET)
+    return kalman(shown.rig)(keypoints=keypoints, names=WITH_FEET)
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +70,7 @@ def spoiled(four):
     other = [WITH_FEET.index(_other(WITH_FEET[i])) for i in moved]
     cases["turned"][8:20, 2][:, moved] = keypoints[8:20, 2][:, other]
     cases["elsewhere"][:, 3, :15] = torch.nan
-    tracks = BodyTracker(shown.rig, "kalman", fps=FPS)(
-        keypoints=torch.stack([*cases.values()]), names=WITH_FEET
-    )
+    tracks = kalman(shown.rig)(keypoints=torch.stack([*cases.values()]), names=WITH_FEET)
     return dict(zip(cases, tracks, strict=True))
 
 
@@ -97,7 +92,7 @@ def test_ellipsoids_hold_heels_and_toes(four, tracked):
 
 def test_the_fifteen_joints_are_what_they_are_without_feet(four, tracked):
     shown = four[0]
-    alone = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=shown.keypoints, names=NAMES)
+    alone = kalman(shown.rig)(keypoints=shown.keypoints)
     assert alone.feet is None
     assert not any(name.startswith("f") for name in alone.details)
     for name in ("joints3d", "covariance3d", "state", "log_evidence"):
@@ -107,7 +102,7 @@ def test_the_fifteen_joints_are_what_they_are_without_feet(four, tracked):
 
 def test_smoothed_feet_are_nearer_and_surer(four, tracked):
     shown, feet, keypoints = four
-    tracker = BodyTracker(shown.rig, "kalman", fps=FPS)
+    tracker = kalman(shown.rig)
     smoothed = tracker(keypoints=keypoints, names=WITH_FEET, smoothing="full")
     assert float(errors(smoothed, feet).mean()) < float(errors(tracked, feet).mean())
     assert float(smoothed.feet.points_std().mean()) < float(tracked.feet.points_std().mean())
@@ -115,7 +110,7 @@ def test_smoothed_feet_are_nearer_and_surer(four, tracked):
 
 def test_frame_by_frame_gives_the_same_feet(four, tracked):
     shown, _, keypoints = four
-    tracker = BodyTracker(shown.rig, "kalman", fps=FPS)
+    tracker = kalman(shown.rig)
     stream = tracker.init(names=WITH_FEET)
     for t in range(8):
         stream, pose = tracker.step(stream, keypoints=keypoints[t])
@@ -126,7 +121,7 @@ def test_frame_by_frame_gives_the_same_feet(four, tracked):
 
 def test_live_there_are_no_feet_before_the_first_pose(four):
     shown, _, keypoints = four
-    tracker = BodyTracker(shown.rig, "kalman", fps=FPS)
+    tracker = kalman(shown.rig)
     nothing = torch.full_like(keypoints[0], torch.nan)
     stream, pose = tracker.step(tracker.init(), keypoints=nothing, names=WITH_FEET)
     assert bool(pose.feet.points3d.isnan().all())
@@ -181,7 +176,7 @@ def test_a_batch_gives_each_its_own_feet(four, tracked):
     shown, _, keypoints = four
     other = torch.cat([shown.keypoints[:10], with_feet(seed=5, n_frames=10)[2][:, :, 15:]], 2)
     both = torch.stack([keypoints[:10], other])
-    found = BodyTracker(shown.rig, "kalman", fps=FPS)(keypoints=both, names=WITH_FEET)
+    found = kalman(shown.rig)(keypoints=both, names=WITH_FEET)
     assert_close(found[0].feet.points3d, tracked.feet.points3d[:10], atol=1e-9, rtol=0)
     assert not torch.allclose(found[1].feet.points3d, found[0].feet.points3d, atol=1e-4)
 
@@ -192,7 +187,7 @@ def test_several_persons_have_their_feet(four, tracked):
     moved = shown.joints[:frames] + torch.tensor([1.2, 0.0, 0.3], dtype=torch.float64)
     second = shown.rig(torch.cat([moved, standing_feet(moved)], 1)).pixels
     people = torch.stack([second, keypoints[:frames]], 2)
-    tracker = BodyTracker(shown.rig, "kalman", fps=FPS)
+    tracker = kalman(shown.rig)
     found = tracker(keypoints=people, names=WITH_FEET, persons="all")
     assert len(found) == 2
     truths = (standing_feet(moved), feet[:frames])
@@ -210,17 +205,13 @@ def test_several_persons_have_their_feet(four, tracked):
 @pytest.mark.slow
 def test_refined_cameras_give_feet(four):
     shown, feet, keypoints = four
-    found = BodyTracker(shown.rig, "kalman", fps=FPS)(
-        keypoints=keypoints, names=WITH_FEET, refine="delays"
-    )
+    found = kalman(shown.rig)(keypoints=keypoints, names=WITH_FEET, refine="delays")
     assert float(errors(found, feet)[5:].mean()) < 25
 
 
 def test_one_camera_finds_feet_where_it_has_the_ankles(four):
     shown, feet, keypoints = with_feet(1)
-    found = BodyTracker(shown.rig, "kalman", fps=FPS, height=1.7)(
-        keypoints=keypoints, names=WITH_FEET
-    )
+    found = kalman(shown.rig, height=1.7)(keypoints=keypoints, names=WITH_FEET)
     begun = found.first_frame
     away = found.feet.points3d - found.joints3d[:, ANKLE_OF]
     true = (feet - shown.joints[:, ANKLE_OF])[begun:]
@@ -262,7 +253,7 @@ def test_feet_in_a_camera_that_is_turned_count_as_its_body_does():
     rig.translation[1] = turn @ rig.translation[1]
     alone = keypoints.clone()
     alone[:, [0, 2], 15:] = torch.nan  # feet are seen by the turned camera alone
-    found = BodyTracker(rig, "kalman", fps=FPS)(keypoints=alone, names=WITH_FEET)
+    found = kalman(rig)(keypoints=alone, names=WITH_FEET)
     assert any("seems to be turned" in note for note in found.notes)
     assert float(found.feet.inlier[10:, 1].mean()) > 0.8
     assert float(errors(found, feet)[10:].mean()) < 60
@@ -342,7 +333,7 @@ def test_feet_of_an_animation_end_at_their_toes(tmp_path, tracked):
 
 
 def test_derivatives_of_feet_are_those_of_differences(tracked):
-    tracker = BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints
+    tracker = kalman(ring(2)).by_keypoints
     filter: FootFilter = tracker.feet
     generator = torch.Generator().manual_seed(0)
     body = tracker.tracker.filter
@@ -365,7 +356,7 @@ def test_derivatives_of_feet_are_those_of_differences(tracked):
 
 
 def test_the_rotation_of_a_shank_is_as_unsure_as_its_joints_say():
-    tracker = BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints
+    tracker = kalman(ring(2)).by_keypoints
     frame = tracker.reader.frames(scene(2, 1).keypoints, None, NAMES, None)
     _, pose, _ = tracker.tracker.advance(None, frame)
     filter, body = tracker.feet, tracker.tracker.filter.articulation

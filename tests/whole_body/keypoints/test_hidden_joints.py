@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-import torchpose
-from tests.whole_body.keypoints.scenes import FPS, NAMES, Scene, errors, ring
+from tests.whole_body.keypoints.scenes import FPS, errors, kalman, ring, seen_by
 from torchpose.body import BODY_15, Body
 from torchpose.whole_body._keypoints.body_kalman import Speeds
 from torchpose.whole_body._keypoints.body_smoothing import beginnings, from_last_seen
@@ -26,17 +25,13 @@ def standing():
     at = {name: 3 + 3 * i for i, name in enumerate(BODY_15.parts)}
     frames = torch.arange(42, dtype=torch.float64)
     state[:, at["right_upper_arm"]] = -1.4 * ((frames - 20.0) / 8.0).clamp(0.0, 1.0)
-    joints, rig = body.joints(state), ring(4)
-    pixels = rig(joints).pixels
-    generator = torch.Generator().manual_seed(0)
-    pixels = pixels + 4.0 * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
-    pixels[GAP, :, ARM] = torch.nan
-    return Scene(joints, rig, pixels, torch.full_like(pixels[..., 0], 0.9))
+    found = seen_by(ring(4), body.joints(state))
+    found.keypoints[GAP, :, ARM] = torch.nan
+    return found
 
 
 def track(given, keypoints, smoothing):
-    tracker = torchpose.BodyTracker(given.rig, method="kalman", fps=FPS)
-    return tracker(keypoints=keypoints, names=NAMES, smoothing=smoothing)
+    return kalman(given.rig)(keypoints=keypoints, smoothing=smoothing)
 
 
 def test_smoothed_arms_that_move_while_hidden_are_nearer_than_a_straight_line(standing):

@@ -8,7 +8,16 @@ import pytest
 import torch
 
 import torchpose
-from tests.whole_body.keypoints.scenes import FPS, NAMES, errors, moving_body, ring, scene
+from tests.whole_body.keypoints.scenes import (
+    FPS,
+    NAMES,
+    errors,
+    kalman,
+    moving_body,
+    ring,
+    scene,
+    track,
+)
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import (
@@ -34,16 +43,6 @@ pytestmark = pytest.mark.usefixtures("undoubted_cameras")
 
 J = BODY_15.joint
 T = 34
-
-
-def tracker(rig, **options):
-    return BodyTracker(rig, method="kalman", fps=FPS, **options)
-
-
-def track(given, smoothing="none", **options):
-    return tracker(given.rig, **options)(
-        keypoints=given.keypoints, confidence=given.confidence, smoothing=smoothing
-    )
 
 
 @pytest.fixture(scope="module")
@@ -120,26 +119,26 @@ def test_who_is_upright_is_seen_so_where_up_is_known():
     pixels = rig(joints).pixels
 
     def lean(**options) -> float:
-        found = tracker(rig, **options)(keypoints=pixels).joints3d[10:]
+        found = kalman(rig, **options)(keypoints=pixels).joints3d[10:]
         trunk = (found[:, J("neck")] - found[:, J("pelvis")]).mean(0)
         return float(torch.acos(trunk[1] / trunk.norm()))
 
     known = lean(up="y")
     assert known < 0.12 and known < lean()
     with pytest.raises(InputError, match="up must be one of"):
-        tracker(rig, up="x")
+        kalman(rig, up="x")
 
 
 def test_a_motion_is_taken_by_its_name_or_as_it_is(four, filtered):
     few = four.keypoints[:5]
-    by_name = tracker(four.rig, motion="whole-body")(keypoints=few, confidence=four.confidence[:5])
-    itself = tracker(four.rig, motion=load_body_motion("whole-body"))(
+    by_name = kalman(four.rig, motion="whole-body")(keypoints=few, confidence=four.confidence[:5])
+    itself = kalman(four.rig, motion=load_body_motion("whole-body"))(
         keypoints=few, confidence=four.confidence[:5]
     )
     assert torch.equal(by_name.joints3d, filtered.joints3d[:5])
     assert torch.equal(itself.joints3d, filtered.joints3d[:5])
     with pytest.raises(PriorError):
-        tracker(four.rig, motion="no such motion")
+        kalman(four.rig, motion="no such motion")
 
 
 # --- faults -----------------------------------------------------------------------------------------
@@ -152,7 +151,7 @@ def tracked_together(seen, cases):
     """What was there, and the track, of each case of (joints, keypoints), in one batch."""
     keypoints = torch.stack([pixels for _, pixels in cases.values()])
     confidence = seen.confidence.expand(len(cases), -1, -1, -1)
-    tracks = tracker(seen.rig)(keypoints=keypoints, confidence=confidence)
+    tracks = kalman(seen.rig)(keypoints=keypoints, confidence=confidence)
     return {
         name: (joints, found)
         for (name, (joints, _)), found in zip(cases.items(), tracks, strict=True)
@@ -296,7 +295,7 @@ def test_a_joint_is_found_where_cameras_agree_for_some_frames_of_which_none_tell
     two = scene(2, 22)
     joints, keypoints = _with_a_bone_along_the_view(two, "right_ankle")
     doubtful = torch.full_like(two.confidence, confidence)
-    found = tracker(two.rig)(keypoints=keypoints, confidence=doubtful)
+    found = kalman(two.rig)(keypoints=keypoints, confidence=doubtful)
     wrong = errors(found, joints)[:, J("right_ankle")]
     assert float(wrong[13]) > 0.4 and float(wrong[17:].max()) < 0.05
 
@@ -311,7 +310,7 @@ def test_a_body_begins_right_though_one_of_two_cameras_exchanges_its_legs(misled
 def test_legs_that_began_on_the_wrong_sides_are_turned_back(monkeypatch):
     monkeypatch.setattr(keypoint_tracker, "likeliest_start", start)
     two = scene(2, 10)
-    found = tracker(two.rig)(keypoints=_with_exchanged_legs(two, 0, slice(0, 3)))
+    found = kalman(two.rig)(keypoints=_with_exchanged_legs(two, 0, slice(0, 3)))
     legs = errors(found, two.joints)[:, BOTH_LEGS].mean(-1)
     assert float(legs[2]) > 0.06 and float(legs[7:].max()) < 0.03
     assert (found.details["exchanged"][7:] < 0.1).all()
@@ -335,7 +334,7 @@ def test_live_steps_tell_when_tracking_begins_anew(returning, persons):
     keypoints = returning.keypoints[:48]
     if persons is not None:  # one of several who is away for a second is another one
         keypoints = torch.cat([keypoints[:35], returning.keypoints[46:48]])[:, :, None]
-    live = tracker(returning.rig)
+    live = kalman(returning.rig)
     whole = live(keypoints=keypoints, persons=persons)
     (whole,) = whole if isinstance(whole, list) else [whole]
     state, anew = live.init(), []
@@ -373,7 +372,7 @@ def test_who_comes_late_has_no_earlier_pose(smoothing):
     small = scene(3, 6, height=0.9)
     late = torch.cat([torch.full_like(small.keypoints, math.nan), small.keypoints])
     found, alone = (
-        tracker(small.rig)(keypoints=k, smoothing=smoothing) for k in (late, small.keypoints)
+        kalman(small.rig)(keypoints=k, smoothing=smoothing) for k in (late, small.keypoints)
     )
     assert found.first_frame == 6 and len(found) == 6
     assert found.notes == (*alone.notes, late_note(6, TOO_FEW)[0])
@@ -381,7 +380,7 @@ def test_who_comes_late_has_no_earlier_pose(smoothing):
     torch.testing.assert_close(found.joints3d, alone.joints3d, rtol=0, atol=1e-14)
     torch.testing.assert_close(found.state, alone.state, rtol=0, atol=1e-14)
     assert found.body.height == pytest.approx(0.9, abs=0.1)
-    together = tracker(small.rig)(keypoints=torch.stack([late, late.flip(0)]), smoothing=smoothing)
+    together = kalman(small.rig)(keypoints=torch.stack([late, late.flip(0)]), smoothing=smoothing)
     assert [(one.first_frame, len(one)) for one in together] == [(6, 6), (0, 12)]
     torch.testing.assert_close(together[0].joints3d, alone.joints3d)
 
@@ -389,7 +388,7 @@ def test_who_comes_late_has_no_earlier_pose(smoothing):
 def test_a_late_track_is_written_with_its_frames(tmp_path):
     small = scene(3, 4, height=0.9)
     late = torch.cat([torch.full_like(small.keypoints, math.nan), small.keypoints])
-    found = tracker(small.rig)(keypoints=late)
+    found = kalman(small.rig)(keypoints=late)
     found.save(tmp_path / "body.npz")
     assert BodyTrack.load(tmp_path / "body.npz").first_frame == 4
     found.export(tmp_path / "body.trc")
@@ -400,13 +399,13 @@ def test_a_late_track_is_written_with_its_frames(tmp_path):
 def test_cameras_of_a_late_track_are_refined_from_its_beginning():
     given = scene(2, 12)
     late = torch.cat([torch.full_like(given.keypoints[:6], math.nan), given.keypoints])
-    found = tracker(given.rig)(keypoints=late, refine="extrinsics")
+    found = kalman(given.rig)(keypoints=late, refine="extrinsics")
     assert (found.first_frame, len(found)) == (6, 12)
     assert len(found.details["camera_delays"]) == 12
 
 
 def test_live_there_is_no_pose_before_the_first(four, tmp_path):
-    live = tracker(four.rig)
+    live = kalman(four.rig)
     nothing = torch.full_like(four.keypoints[0], math.nan)
     state, before = live.step(live.init(), keypoints=nothing)
     state, begun = live.step(state, keypoints=four.keypoints[0])
@@ -425,7 +424,7 @@ def test_who_is_never_seen_well_enough_is_nobody():
     given.keypoints[:, 0, 5:] = math.nan
     given.keypoints[:, 1] = math.nan
     with pytest.raises(NobodySeenError, match="two cameras"):
-        tracker(given.rig)(keypoints=given.keypoints)
+        kalman(given.rig)(keypoints=given.keypoints)
 
 
 # --- one of several cameras -------------------------------------------------------------------------
@@ -434,7 +433,7 @@ def test_who_is_never_seen_well_enough_is_nobody():
 def test_a_start_waits_for_a_second_camera(four):
     late = four.keypoints[:, :2].clone()
     late[:5, 1] = torch.nan
-    found = tracker(four.rig.select([0, 1]))(keypoints=late)
+    found = kalman(four.rig.select([0, 1]))(keypoints=late)
     assert found.first_frame == 5 and not found.coasting.any()
     assert float(errors(found, four.joints[5:])[5:].mean()) < 0.025
 
@@ -442,9 +441,9 @@ def test_a_start_waits_for_a_second_camera(four):
 def test_one_of_several_cameras_tracks_as_if_it_were_the_only_one():
     given = scene(3, 30, noise=2.0)
     given.keypoints[:, 1:] = torch.nan
-    found = tracker(given.rig)(keypoints=given.keypoints)
+    found = kalman(given.rig)(keypoints=given.keypoints)
     assert found.first_frame == 16  # half a second later
-    one = tracker(given.rig.select([0]))(keypoints=given.keypoints[16:, :1])
+    one = kalman(given.rig.select([0]))(keypoints=given.keypoints[16:, :1])
     torch.testing.assert_close(found.joints3d, one.joints3d)
     assert any("one camera alone (c0)" in note for note in found.notes)
     ray = torch.nn.functional.normalize(found.joints3d[-1, 0] - _centre(given.rig, 0), dim=0)
@@ -457,7 +456,7 @@ def test_one_of_several_cameras_tracks_as_if_it_were_the_only_one():
 def test_a_second_camera_begins_anew_what_one_had_to_guess():
     given = scene(2, 30, noise=2.0, height=1.3)
     given.keypoints[:20, 1] = torch.nan
-    found = tracker(given.rig)(keypoints=given.keypoints)
+    found = kalman(given.rig)(keypoints=given.keypoints)
     assert found.first_frame == 16 and found.respread.nonzero().tolist() == [[4]]
     off = errors(found, given.joints[16:]).mean(-1)
     assert float(off[:4].min()) > 0.5 and float(off[4:].max()) < 0.05
@@ -473,7 +472,7 @@ def handed(first, second):
 def test_one_camera_hands_a_person_to_the_next():
     """As in a corridor where no two cameras see the same place."""
     given = scene(2, 26, noise=2.0)
-    found = tracker(given.rig)(keypoints=handed(given, given))
+    found = kalman(given.rig)(keypoints=handed(given, given))
     assert found.first_frame == 16 and not found.coasting.any()
     assert found.respread.nonzero().tolist() == [[4]]
     assert float(errors(found, given.joints[16:]).mean(-1).max()) < 0.4
@@ -484,7 +483,7 @@ def test_another_camera_that_sees_somebody_else_goes_on_after_half_a_second():
     given = scene(2, 40, noise=2.0)
     aside = given.joints + torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64)
     other = given._replace(keypoints=given.rig(aside).pixels)
-    found = tracker(given.rig)(keypoints=handed(given, other))
+    found = kalman(given.rig)(keypoints=handed(given, other))
     assert found.respread.nonzero().tolist() == [[20]]
     assert found.coasting[4:20].all() and not found.coasting[20:].any()
     assert float(errors(found, aside[16:])[20:].mean()) < 0.4
@@ -509,7 +508,7 @@ def test_hips_that_no_camera_sees_go_along_with_who_walks():
     keypoints[:, :, J("neck")] = keypoints[:, :, shoulders].mean(2)
     legs = [j for j, name in enumerate(NAMES) if name.endswith(("knee", "ankle"))]
     keypoints[:, :, HIPS + legs] = math.nan
-    found = tracker(given.rig)(keypoints=keypoints)
+    found = kalman(given.rig)(keypoints=keypoints)
     off = (found.joints3d - joints)[20:, HIPS]
     assert float(off[..., [0, 2]].norm(dim=-1).mean()) < 0.025  # across the room
     assert float(off.norm(dim=-1).mean()) < 0.07  # the trunk has the usual length
@@ -550,7 +549,7 @@ def test_ellipsoids_hold_the_legs_of_who_sits_behind_a_desk():
     given = scene(2, 20)
     joints = seated(given.joints)
     keypoints, names = at_desk(given.rig(joints).pixels)
-    found = tracker(given.rig)(keypoints=keypoints, names=names)
+    found = kalman(given.rig)(keypoints=keypoints, names=names)
     off = (found.joints3d - joints)[10:, LEGS]
     squared = (off * torch.linalg.solve(found.covariance3d[10:, LEGS], off)).sum(-1)
 
@@ -561,7 +560,7 @@ def test_legs_that_no_camera_ever_sees_hang_less_far_than_straight_ones():
     """So they are nearer to all the poses in which they may be."""
     given = scene(2, 30)
     keypoints, names = at_desk(given.rig(given.joints).pixels)
-    found = tracker(given.rig)(keypoints=keypoints, names=names).joints3d[20:]
+    found = kalman(given.rig)(keypoints=keypoints, names=names).joints3d[20:]
     hips, knees, ankles = (
         found[:, [J(f"{side}_{name}") for side in ("left", "right")]]
         for name in ("hip", "knee", "ankle")
@@ -575,7 +574,7 @@ def test_legs_that_were_seen_to_sit_go_on_sitting_for_a_second():
     joints = seated(given.joints)
     keypoints = given.rig(joints).pixels
     keypoints[20:, :, HIPS + LEGS] = math.nan
-    found = tracker(given.rig)(keypoints=keypoints).joints3d
+    found = kalman(given.rig)(keypoints=keypoints).joints3d
     assert float((found - joints)[20:, LEGS].norm(dim=-1).mean()) < 0.2
 
 
@@ -617,13 +616,13 @@ def test_a_person_of_no_persons_size_is_said():
 @pytest.mark.parametrize("told", [{"height": 2.1}, {"body": Body.of_height(BODY_15, 1.4)}])
 def test_cameras_that_measure_another_size_than_was_given_say_so(told):
     given = scene(3, n_frames=20, height=1.7)
-    (note,) = tracker(given.rig, **told)(keypoints=given.keypoints).notes
+    (note,) = kalman(given.rig, **told)(keypoints=given.keypoints).notes
     size = "2.10" if "height" in told else "1.40"
     assert note.startswith(
         f"the person is {size} m tall by the given height or body, and by the cam"
     )
     near = {name: 1.75 if name == "height" else Body.of_height(BODY_15, 1.6) for name in told}
-    assert tracker(given.rig, **near)(keypoints=given.keypoints).notes == ()
+    assert kalman(given.rig, **near)(keypoints=given.keypoints).notes == ()
 
 
 # --- forms ------------------------------------------------------------------------------------------
@@ -638,14 +637,14 @@ def test_a_camera_whose_video_stands_still_is_named():
         "the keypoints of camera c are exactly the same in frames 15 to 49, which"
     )
     pixels[:, 2] = pixels[0, 2]
-    (note,) = BodyTracker(ring(3), "kalman", fps=FPS)(keypoints=pixels).notes
+    (note,) = kalman(ring(3))(keypoints=pixels).notes
     assert "camera c2 are exactly the same in frames 0 to 39" in note
     everything = pixels[:1].expand_as(pixels)  # a person who does not move at all
     assert notes_on_still_cameras(("a", "b", "c"), everything, there) == ()
 
 
 def test_frame_by_frame_gives_the_same(four, filtered):
-    live = tracker(four.rig)
+    live = kalman(four.rig)
     state, poses = live.init(), []
     for keypoints, confidence in zip(four.keypoints[:12], four.confidence[:12], strict=True):
         state, pose = live.step(state, keypoints=keypoints, confidence=confidence)
@@ -674,7 +673,7 @@ def test_a_batch_of_different_lengths_gives_each_its_own(n_cameras, smoothing):
     close = (
         1e-9 if n_cameras > 1 else 1e-6
     )  # of one camera a network of single precision lifts poses
-    follow = tracker(given.rig)
+    follow = kalman(given.rig)
     tracks = follow(
         keypoints=keypoints, confidence=confidence, smoothing=smoothing, lengths=lengths
     )
@@ -685,28 +684,28 @@ def test_a_batch_of_different_lengths_gives_each_its_own(n_cameras, smoothing):
     cut = follow(
         keypoints=keypoints[0], confidence=confidence[0], smoothing=smoothing, lengths=lengths[:1]
     )
-    for track, own, near in (*zip(tracks, alone, 3 * [close], strict=True), (cut, alone[0], 1e-9)):
+    for one, own, near in (*zip(tracks, alone, 3 * [close], strict=True), (cut, alone[0], 1e-9)):
         n = len(own)
         for name in ("joints3d", "covariance3d", "state", "coasting"):
             expected = getattr(own, name)
-            torch.testing.assert_close(getattr(track, name)[:n], expected, rtol=0, atol=near)
-        assert track.notes == own.notes and len(track) == 7
-        assert (track.joints3d[n:] == track.joints3d[n - 1]).all()
-        assert not track.log_evidence[n:].any()
+            torch.testing.assert_close(getattr(one, name)[:n], expected, rtol=0, atol=near)
+        assert one.notes == own.notes and len(one) == 7
+        assert (one.joints3d[n:] == one.joints3d[n - 1]).all()
+        assert not one.log_evidence[n:].any()
 
 
 def test_lengths_that_no_sequence_has_are_refused(four):
     for wrong in ([0], [T + 1], [3, 4]):
         with pytest.raises((InputError, ShapeError), match="lengths must"):
-            tracker(four.rig)(keypoints=four.keypoints, lengths=torch.tensor(wrong))
+            kalman(four.rig)(keypoints=four.keypoints, lengths=torch.tensor(wrong))
     detections = four.keypoints[:, :, None]
     with pytest.raises(InputError, match="lengths does nothing with persons"):
-        tracker(four.rig)(keypoints=detections, persons="all", lengths=torch.tensor([3]))
+        kalman(four.rig)(keypoints=detections, persons="all", lengths=torch.tensor([3]))
 
 
 def test_a_joint_set_in_another_order_and_without_a_pelvis(four, filtered):
     order = [i for i in range(len(NAMES)) if NAMES[i] != "pelvis"][::-1]
-    found = tracker(four.rig)(
+    found = kalman(four.rig)(
         keypoints=four.keypoints[:16, :, order],
         confidence=four.confidence[:16, :, order],
         names=[NAMES[i] for i in order],
@@ -738,7 +737,7 @@ def test_a_face_tells_where_the_head_is():
 
     def off(wanted: list[str]) -> float:
         columns = [[*names, "left_ear", "right_ear"].index(n) for n in wanted]
-        found = tracker(given.rig)(
+        found = kalman(given.rig)(
             keypoints=pixels[:, :, columns], confidence=confidence[:, :, columns], names=wanted
         )
         return float((found.joints3d - joints)[10:, J("head")].norm(dim=-1).mean())
@@ -770,7 +769,7 @@ def test_distorted_keypoints_are_undistorted(four):
     distorted = torch.stack(seen, 1)
     straight = rig.undistort_points(distorted)
     torch.testing.assert_close(straight, rig(four.joints).pixels, rtol=0, atol=0.01)
-    found = tracker(rig)(keypoints=distorted[:16])
+    found = kalman(rig)(keypoints=distorted[:16])
     assert float(errors(found, four.joints[:16])[10:].mean()) < 0.008
 
 
@@ -784,7 +783,7 @@ def test_tracks_are_saved_and_read_back(tmp_path, filtered):
 
 def test_a_known_body_keeps_its_bones(four, filtered):
     body = Body.of_height(BODY_15, 1.7)
-    found = tracker(four.rig, body=body)(keypoints=four.keypoints[:12])
+    found = kalman(four.rig, body=body)(keypoints=four.keypoints[:12])
     lengths = found.details["bone_lengths"][:, J("left_knee")]
     assert float((lengths / body.bone_lengths[J("left_knee")] - 1).abs().max()) < 0.02
 
@@ -811,26 +810,26 @@ def test_a_known_body_keeps_its_bones(four, filtered):
 def test_bad_input_is_refused(four, change, error, words):
     given = {"keypoints": four.keypoints, "confidence": None, **change}
     with pytest.raises(error, match=words):
-        tracker(four.rig)(**given)
+        kalman(four.rig)(**given)
 
 
 def test_keypoints_of_another_image_size_are_refused(four):
     with pytest.raises(CameraError, match="scaled"):
-        tracker(four.rig)(keypoints=4 * four.keypoints)
+        kalman(four.rig)(keypoints=4 * four.keypoints)
     third = four.keypoints.clone()
     third[:, 2] *= 4
     with pytest.raises(CameraError, match=four.rig.names[2]):
-        tracker(four.rig)(keypoints=third)
+        kalman(four.rig)(keypoints=third)
     few = third[:4].clone()
     few[:, 2, :8] = four.keypoints[:4, 2, :8]
-    assert len(tracker(four.rig)(keypoints=few)) == len(few)
+    assert len(kalman(four.rig)(keypoints=few)) == len(few)
 
 
 @pytest.mark.parametrize("persons", [None, "all"])
 def test_keypoints_of_larger_images_are_refused_by_a_single_camera(persons):
     given = scene(1, n_frames=12)
     given.keypoints[..., 0] += 300  # so that a part is to the right of the image of half the size
-    alone = tracker(given.rig)
+    alone = kalman(given.rig)
     keypoints = given.keypoints if persons is None else given.keypoints[:, :, None]
     doubled = 2 * keypoints
     with pytest.raises(CameraError, match="right of its image of 1920 x 1080 pixels or below"):
@@ -845,7 +844,7 @@ def test_keypoints_of_larger_images_are_refused_by_a_single_camera(persons):
 def test_cameras_in_millimetres_are_refused():
     camera = PinholeCamera(1300, 1300, 959.5, 539.5, 1920, 1080, translation=(0, 0, 4000.0))
     with pytest.raises(CameraError, match="metres"):
-        tracker(camera)
+        kalman(camera)
 
 
 @pytest.mark.parametrize(
@@ -857,7 +856,7 @@ def test_cameras_in_millimetres_are_refused():
 )  # fmt: skip
 def test_options_of_other_methods_are_refused(options):
     with pytest.raises(InputError):
-        tracker(ring(2), **options)
+        kalman(ring(2), **options)
 
 
 def test_other_methods_take_no_options_of_this_one(four):
@@ -888,7 +887,7 @@ def test_arguments_of_other_kinds_are_refused(method, options, said):
 
 def test_the_tracker_is_at_the_top():
     assert torchpose.BodyTracker is BodyTracker
-    assert math.isclose(tracker(ring(2)).fps, FPS)
+    assert math.isclose(kalman(ring(2)).fps, FPS)
 
 
 @pytest.mark.parametrize("nothing", [0.0, -1.0])
@@ -900,7 +899,7 @@ def test_what_detectors_write_where_they_found_nothing_is_missing(cameras, nothi
     filled, unknown = (
         given.keypoints.masked_fill(missing[..., None], value) for value in (nothing, math.nan)
     )
-    found, wanted = (tracker(given.rig)(keypoints=values) for values in (filled, unknown))
+    found, wanted = (kalman(given.rig)(keypoints=values) for values in (filled, unknown))
     assert found.first_frame == wanted.first_frame == 2
     torch.testing.assert_close(found.joints3d, wanted.joints3d, rtol=0, atol=0)
 
@@ -910,18 +909,18 @@ def test_the_covariance_of_a_missing_keypoint_does_not_matter(nothing):
     given = scene(2, 4)
     given.keypoints[:, 0, 7] = math.nan
     covariance = torch.full_like(given.confidence, 9.0)
-    usual = tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+    usual = kalman(given.rig)(keypoints=given.keypoints, covariance=covariance)
     covariance[:, 0, 7] = nothing
-    found = tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+    found = kalman(given.rig)(keypoints=given.keypoints, covariance=covariance)
     torch.testing.assert_close(found.joints3d, usual.joints3d, rtol=0, atol=0)
     covariance[:, 0, 6] = nothing
     with pytest.raises(InputError, match="covariance"):
-        tracker(given.rig)(keypoints=given.keypoints, covariance=covariance)
+        kalman(given.rig)(keypoints=given.keypoints, covariance=covariance)
 
 
 def test_arguments_of_other_methods_are_refused():
     given = scene(2, 2)
-    kalman = tracker(given.rig)
+    tracker = kalman(given.rig)
     unused = {
         "generator": torch.Generator(), "initial_state": torch.zeros(36),
         "facing": torch.tensor([1.0, 0.0, 0.0]),
@@ -930,21 +929,21 @@ def test_arguments_of_other_methods_are_refused():
         with pytest.raises(
             InputError, match=f"{name} does nothing for method kalman; leave it out"
         ):
-            kalman(keypoints=given.keypoints, **{name: value})
+            tracker(keypoints=given.keypoints, **{name: value})
     for name, value in unused.items():
         with pytest.raises(InputError, match=name):
-            kalman.init(**{name: value})
+            tracker.init(**{name: value})
 
 
 def test_names_of_a_stream_hold_for_all_frames(four):
     order = torch.arange(15).flip(0)
     names = [NAMES[j] for j in order.tolist()]
-    kalman = tracker(four.rig)
-    given, stated = kalman.init(names=names), kalman.init()
+    tracker = kalman(four.rig)
+    given, stated = tracker.init(names=names), tracker.init()
     for t in range(4):
         frame = {"keypoints": four.keypoints[t][:, order], "confidence": four.confidence[t]}
-        given, pose = kalman.step(given, **frame)
-        stated, same = kalman.step(stated, **frame, names=names)
+        given, pose = tracker.step(given, **frame)
+        stated, same = tracker.step(stated, **frame, names=names)
         torch.testing.assert_close(pose.joints3d, same.joints3d, rtol=0, atol=0)
     assert float((pose.joints3d[0] - four.joints[3]).norm(dim=-1).mean()) < 0.03
     other = BodyTracker(four.rig, "sir", height=1.7, n_particles=50)
@@ -979,12 +978,12 @@ def test_what_keypoints_are_is_said(four, changes, error, said):
     given = {"keypoints": four.keypoints, "confidence": four.confidence}
     given = {name: changes.get(name, lambda v: v)(value) for name, value in given.items()}
     with pytest.raises(error, match=said):
-        tracker(four.rig)(**given)
+        kalman(four.rig)(**given)
 
 
 def test_peaks_of_heat_maps_count_as_one(four):
     plain, peaks = (
-        tracker(four.rig)(keypoints=four.keypoints[:4], confidence=torch.full((4, 4, 15), value))
+        kalman(four.rig)(keypoints=four.keypoints[:4], confidence=torch.full((4, 4, 15), value))
         for value in (1.0, 1.02)
     )
     torch.testing.assert_close(peaks.joints3d, plain.joints3d, rtol=0, atol=0)
@@ -993,26 +992,26 @@ def test_peaks_of_heat_maps_count_as_one(four):
 def test_confidences_of_another_scale_are_named(four):
     frames = four.keypoints[:4]
     said = [
-        "confidence below 0.1" in " ".join(tracker(four.rig)(keypoints=frames, confidence=c).notes)
+        "confidence below 0.1" in " ".join(kalman(four.rig)(keypoints=frames, confidence=c).notes)
         for c in (0.03 * four.confidence[:4], 0.3 * four.confidence[:4], None)
     ]
     assert said == [True, False, False]
 
 
 def test_single_precision_leaves_the_filter_double(four):
-    plain = tracker(four.rig)(keypoints=four.keypoints[:4], confidence=four.confidence[:4])
-    module = torch.nn.Sequential(tracker(four.rig)).float()
+    plain = kalman(four.rig)(keypoints=four.keypoints[:4], confidence=four.confidence[:4])
+    module = torch.nn.Sequential(kalman(four.rig)).float()
     same = module[0](keypoints=four.keypoints[:4], confidence=four.confidence[:4])
     torch.testing.assert_close(same.joints3d, plain.joints3d, rtol=0, atol=0)
 
 
 def test_a_height_in_centimetres_and_no_state_are_refused(four):
     with pytest.raises(InputError, match=r"height must lie between 0\.5 and 2\.6 m, got 175"):
-        tracker(four.rig, height=175)
+        kalman(four.rig, height=175)
     with pytest.raises(
         InputError, match="state must be a BodyStream, got NoneType; begin with init"
     ):
-        tracker(four.rig).step(None, keypoints=four.keypoints[0])
+        kalman(four.rig).step(None, keypoints=four.keypoints[0])
 
 
 @pytest.mark.parametrize("method", ["kalman", "sir"])
@@ -1023,35 +1022,33 @@ def test_a_height_beside_a_body_is_refused(four, method):
 
 
 def test_states_of_a_tracker_with_other_options_are_refused(four):
-    mine = tracker(four.rig)
+    mine = kalman(four.rig)
     state, _ = mine.step(mine.init(), keypoints=four.keypoints[0])
     others = {
         f"fps=15.0, got that of a tracker with fps={FPS:g}": BodyTracker(
             four.rig, "kalman", fps=15
         ),
-        "with cameras='{0}, {1}', got .* cameras='{0}, {1}, .*'".format(*four.rig.names): tracker(
+        "with cameras='{0}, {1}', got .* cameras='{0}, {1}, .*'".format(*four.rig.names): kalman(
             four.rig.select([0, 1])
         ),
-        "with cameras=.*got that of a tracker with cameras=": tracker(
-            four.rig.select([1, 0, 2, 3])
-        ),
-        "pixel_std=9, got that of a tracker with pixel_std=None": tracker(four.rig, pixel_std=9),
-        "keypoint_std=0.1, got": tracker(four.rig, keypoint_std=0.1),
-        "body='1.9000 m', got": tracker(four.rig, body=Body.of_height(BODY_15, 1.9)),
-        "height=1.9, got that of a tracker with height=None": tracker(four.rig, height=1.9),
+        "with cameras=.*got that of a tracker with cameras=": kalman(four.rig.select([1, 0, 2, 3])),
+        "pixel_std=9, got that of a tracker with pixel_std=None": kalman(four.rig, pixel_std=9),
+        "keypoint_std=0.1, got": kalman(four.rig, keypoint_std=0.1),
+        "body='1.9000 m', got": kalman(four.rig, body=Body.of_height(BODY_15, 1.9)),
+        "height=1.9, got that of a tracker with height=None": kalman(four.rig, height=1.9),
         "with method='sir', .*got .* method='kalman'": BodyTracker(four.rig, "sir", fps=FPS),
     }
     for message, other in others.items():
         seen = four.keypoints[1][: len(other.cameras)]
         with pytest.raises(InputError, match=f"{message}.*begin with init of this tracker"):
             other.step(state, keypoints=seen)
-    tracker(four.rig).step(state, keypoints=four.keypoints[1])
+    kalman(four.rig).step(state, keypoints=four.keypoints[1])
 
 
 def test_a_keypoint_that_is_of_no_ray_is_missing():
     camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=(-0.35,))
     keypoints = torch.full((1, 1, 15, 2), 600.0).double()
     keypoints[0, 0, 3] = torch.tensor([1900.0, 1000.0])
-    frame = tracker(camera).by_keypoints.reader.frames(keypoints, None, None, None)
+    frame = kalman(camera).by_keypoints.reader.frames(keypoints, None, None, None)
     assert (frame.inlier[0, 0] > 0).tolist() == [j != 3 for j in range(15)]
     assert bool(frame.pixels.isfinite().all())

@@ -8,7 +8,7 @@ import torchpose
 from benchmarks.keypoint_bodies.clips import MHAD, WALKS, begun, read_clips
 from benchmarks.keypoint_bodies.sitting import sitting_clips
 from tests.data import data_dir_or_skip
-from tests.whole_body.keypoints.scenes import FPS, NAMES, moving_body, ring, scene
+from tests.whole_body.keypoints.scenes import FPS, NAMES, kalman, moving_body, ring, scene
 from torchpose.body import BODY_15, Body
 from torchpose.body._skeleton import other_side
 from torchpose.camera import CameraRig, PinholeCamera
@@ -46,7 +46,7 @@ LIMBS = [
 
 
 def tracker(**options):
-    return torchpose.BodyTracker(ring(1), "kalman", fps=FPS, **options)
+    return kalman(ring(1), **options)
 
 
 def relative(joints):
@@ -277,7 +277,7 @@ def test_exchanged_sides_at_the_start_are_soon_forgotten():
     wrong[:3] = pixels[:3][..., mirror, :]
     error = []
     for seen in (pixels, wrong):
-        found = tracker()(keypoints=seen, names=NAMES).joints3d
+        found = tracker()(keypoints=seen).joints3d
         error.append(float((relative(found) - relative(joints)).norm(dim=-1)[20:].mean()))
     assert error[1] < error[0] + 0.02
 
@@ -331,7 +331,7 @@ def test_strangers_behind_a_desk_may_sit():
         keypoints = clip.seen.keypoints.clone()
         keypoints[..., LEGS, :] = torch.nan
         track = torchpose.BodyTracker(clip.rig, "kalman", fps=clip.fps)(
-            keypoints=keypoints, confidence=clip.seen.confidence, names=NAMES
+            keypoints=keypoints, confidence=clip.seen.confidence
         )
         found, truth = (relative(x)[..., KNEES, :] for x in (track.joints3d, clip.joints))
         off.append((found - truth[track.first_frame :]).norm(dim=-1).mean())
@@ -341,13 +341,11 @@ def test_strangers_behind_a_desk_may_sit():
 
 def test_steps_are_lifted_as_whole_sequences_are():
     one = scene(1, 6)
-    whole = tracker()(keypoints=one.keypoints, confidence=one.confidence, names=NAMES)
+    whole = tracker()(keypoints=one.keypoints, confidence=one.confidence)
     live, state = tracker(), None
     state = live.init()
     for t in range(6):
-        state, pose = live.step(
-            state, keypoints=one.keypoints[t], confidence=one.confidence[t], names=NAMES
-        )
+        state, pose = live.step(state, keypoints=one.keypoints[t], confidence=one.confidence[t])
         torch.testing.assert_close(pose.joints3d[0], whole.joints3d[t])
 
 
@@ -359,7 +357,7 @@ def test_a_module_in_double_precision_lifts_the_same():
 
 
 def test_several_cameras_lift_nothing():
-    assert torchpose.BodyTracker(ring(2), "kalman", fps=FPS).by_keypoints.tracker.lifter is None
+    assert kalman(ring(2)).by_keypoints.tracker.lifter is None
     assert tracker().by_keypoints.tracker.lifter is not None
 
 
@@ -367,7 +365,7 @@ def test_nobody_at_first_is_no_error_and_begins_later():
     one = scene(1, 8)
     keypoints = one.keypoints.clone()
     keypoints[:3] = torch.nan
-    track = tracker()(keypoints=keypoints, confidence=one.confidence, names=NAMES)
+    track = tracker()(keypoints=keypoints, confidence=one.confidence)
     assert bool(track.joints3d.isfinite().all())
     pixels = one.rig(track.joints3d).pixels
     assert track.first_frame == 3

@@ -8,8 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from tests.whole_body.keypoints.scenes import FPS, NAMES, scene
-from torchpose.whole_body import BodyTracker
+from tests.whole_body.keypoints.scenes import NAMES, kalman, scene
 from torchpose.whole_body._keypoints import body_smoothing, foot_tracker, nested
 from torchpose.whole_body._keypoints.nested import FrameCollector, by_parts, stacked
 
@@ -31,7 +30,7 @@ def tracked(n_cameras, smoothing, feet=False, n_frames=_FEW_FRAMES):
         keypoints = torch.cat([keypoints, toes], 2)
         names = (*NAMES, "left_big_toe", "right_big_toe")
     floor = {"up": "z", "camera_height": 1.4} if n_cameras == 1 else {}
-    tracker = BodyTracker(seen.rig, "kalman", fps=FPS, **floor)
+    tracker = kalman(seen.rig, **floor)
     return tracker(keypoints=keypoints, names=names, smoothing=smoothing)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchpose
-from tests.whole_body.keypoints.scenes import FPS, NAMES, Scene, moving_body, ring, scene
+from tests.whole_body.keypoints.scenes import FPS, Scene, kalman, moving_body, ring, scene, track
 from torchpose.body import BODY_15, Body
 from torchpose.errors import InputError
 from torchpose.priors._shipped import load_body_motion
@@ -101,13 +101,6 @@ def test_a_larger_body_looks_the_same_and_its_tangent_is_that_of_finite_steps():
     small = 1e-6 * torch.randn(1, body.dim, dtype=torch.float64)
     moved = body.difference(resized(body.moved(point, small), log_size, centre), larger)
     torch.testing.assert_close(units_of_size(body, log_size) * small, moved, atol=1e-9, rtol=1e-4)
-
-
-def track(given, smoothing="none", **options):
-    tracker = torchpose.BodyTracker(given.rig, "kalman", fps=FPS, **options)
-    return tracker(
-        keypoints=given.keypoints, confidence=given.confidence, names=NAMES, smoothing=smoothing
-    )
 
 
 def ray_of(given, track):
@@ -234,11 +227,11 @@ def test_a_height_of_the_camera_that_fits_no_person_is_said(error, said):
 
 def test_live_steps_find_the_size_of_whole_sequences():
     given = hidden(scene(1, 12), LEGS, slice(4, 12))
-    tracker = torchpose.BodyTracker(given.rig, "kalman", fps=FPS, up="y", camera_height=1.9)
-    whole = tracker(keypoints=given.keypoints, names=NAMES)
+    tracker = kalman(given.rig, up="y", camera_height=1.9)
+    whole = tracker(keypoints=given.keypoints)
     stream = tracker.init()
     for t in range(12):
-        stream, pose = tracker.step(stream, keypoints=given.keypoints[t], names=NAMES)
+        stream, pose = tracker.step(stream, keypoints=given.keypoints[t])
     torch.testing.assert_close(pose.joints3d[0], whole.joints3d[-1])
     torch.testing.assert_close(pose.covariance3d[0], whole.covariance3d[-1])
     torch.testing.assert_close(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tests.whole_body.keypoints.scenes import FPS, moving_body, ring
+from tests.whole_body.keypoints.scenes import FPS, kalman, moving_body, noisy, ring
 from torchpose.errors import InputError, NobodySeenError, ShapeError
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body import BodyTracker
@@ -27,10 +27,8 @@ def passing(cameras, seed=0):
     joints[:, 1, :, 0] -= along[:, None]
     joints[:, 1, :, 2] += 0.45
     rig = ring(cameras)
-    generator = torch.Generator().manual_seed(seed)
     pixels = torch.stack([rig(joints[:, p]).pixels for p in range(2)], 2)
-    pixels = pixels + 3 * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
-    return rig, joints, pixels
+    return rig, joints, noisy(pixels, 3.0, seed)
 
 
 def shuffled(pixels, seed=1):
@@ -38,17 +36,13 @@ def shuffled(pixels, seed=1):
     return pixels.gather(2, order[..., None, None].expand_as(pixels)), order
 
 
-def tracker(rig):
-    return BodyTracker(rig, method="kalman", fps=FPS)
-
-
 @pytest.mark.parametrize("cameras", [3, 2])
 def test_persons_who_pass_each_other_stay_who_they_are(cameras):
     rig, joints, pixels = passing(cameras)
     mixed, order = shuffled(pixels)
-    found = tracker(rig)(keypoints=mixed, persons="all")
+    found = kalman(rig)(keypoints=mixed, persons="all")
     assert [len(one) for one in found] == [T, T]
-    alone = tracker(rig)(keypoints=pixels.movedim(2, 0))
+    alone = kalman(rig)(keypoints=pixels.movedim(2, 0))
     for one in found:
         p = int((one.joints3d - joints.movedim(1, 0)).norm(dim=-1).mean((1, 2)).argmin())
         error = (one.joints3d - joints[:, p]).norm(dim=-1).mean()
@@ -75,7 +69,7 @@ def test_a_camera_that_is_turned_is_used_all_the_same():
     c, s = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
     rig.rotation[0], rig.translation[0] = turn @ rig.rotation[0], turn @ rig.translation[0]
-    found = tracker(rig)(keypoints=shuffled(pixels[:20])[0], persons="all")
+    found = kalman(rig)(keypoints=shuffled(pixels[:20])[0], persons="all")
     assert [len(one) for one in found] == [20, 20]
     # by 1.3 degrees joints are 9 cm off at 4 m, seven times the noise of keypoints
     for one in found:
@@ -86,7 +80,7 @@ def test_a_camera_that_is_turned_is_turned_back_for_everybody():
     rig, _, pixels = passing(4)
     turn = rotvec_to_matrix(torch.tensor([math.radians(1.5), 0.0, 0.0]).double())
     rig.rotation[1], rig.translation[1] = turn @ rig.rotation[1], turn @ rig.translation[1]
-    found = tracker(rig)(keypoints=shuffled(pixels[:20])[0], persons="all")
+    found = kalman(rig)(keypoints=shuffled(pixels[:20])[0], persons="all")
     assert len(found) == 2
     for track in found:
         angles = torch.rad2deg(angles_of(track.details["camera_turn"][-1]))
@@ -109,7 +103,7 @@ def with_turns(rig, degrees):
 def test_detections_of_turned_cameras_are_those_of_persons_and_begin_nobody(degrees):
     rig, joints, pixels = passing(4)
     pixels = shuffled(pixels)[0][:10]
-    found = tracker(with_turns(rig, degrees))(keypoints=pixels, persons="all")
+    found = kalman(with_turns(rig, degrees))(keypoints=pixels, persons="all")
     assert [(one.first_frame, len(one)) for one in found] == [(0, 10), (0, 10)]
     for one in found:
         assert bool((one.details["detection"] >= 0).all())
@@ -121,7 +115,7 @@ def test_detections_of_turned_cameras_are_those_of_persons_and_begin_nobody(degr
 
 def test_two_detections_of_two_cameras_tell_no_turn():
     rig, _, pixels = passing(3)
-    people = tracker(rig).by_keypoints
+    people = kalman(rig).by_keypoints
     none = torch.eye(3).double().expand(3, 3, 3)
 
     def told(keypoints):
@@ -143,7 +137,7 @@ def test_a_note_names_the_camera_whose_detections_are_nobodys():
     notes = [
         one.notes
         for degrees in (0.0, 40.0)
-        for one in tracker(with_turns(rig, (0.0, degrees, 0.0)))(keypoints=pixels, persons="all")
+        for one in kalman(with_turns(rig, (0.0, degrees, 0.0)))(keypoints=pixels, persons="all")
     ]
     assert len(notes) == 4
     said = [
@@ -157,8 +151,8 @@ def test_a_note_names_the_camera_whose_detections_are_nobodys():
 def test_live_has_the_same_numbers():
     rig, _, pixels = passing(3)
     pixels = shuffled(pixels)[0][:8]
-    whole = tracker(rig)(keypoints=pixels, persons=2)
-    live = tracker(rig)
+    whole = kalman(rig)(keypoints=pixels, persons=2)
+    live = kalman(rig)
     state = live.init()
     for frame in pixels:
         state, now = live.step(state, keypoints=frame, persons=2)
@@ -172,7 +166,7 @@ def test_a_frame_in_which_no_camera_detects_anybody_is_one_of_missing_keypoints(
     rig, _, pixels = passing(2)
     found = []
     for nobody in (pixels[0, :, :0], torch.full_like(pixels[0], torch.nan)):
-        one, state = tracker(rig), tracker(rig).init()
+        one, state = kalman(rig), kalman(rig).init()
         for frame in (nobody, *pixels[:6], nobody, nobody, *pixels[9:11]):
             state, poses = one.step(state, keypoints=frame, persons="all")
         found.append(torch.cat([pose.joints3d for pose in poses]))
@@ -184,7 +178,7 @@ def test_who_enters_late_and_leaves_is_tracked_while_there():
     pixels[:10, :, 1] = math.nan
     pixels[30:, :, 1] = math.nan
     pixels[:, 2, 1] = math.nan  # a camera that sees only the first
-    found = tracker(rig)(keypoints=shuffled(pixels)[0], persons="all", smoothing="full")
+    found = kalman(rig)(keypoints=shuffled(pixels)[0], persons="all", smoothing="full")
     assert [(one.first_frame, len(one)) for one in found] == [(0, T), (10, 20)]
     assert (found[1].details["detection"][:, 2] == -1).all()
 
@@ -201,9 +195,8 @@ def walkers(starts, cameras=2, seconds=1.7, speed=1.2, seed=0):
         joints[:, i, :, 0] += x + speed * time[:, None]
         joints[:, i, :, 2] += z
     rig = ring(cameras)
-    generator = torch.Generator().manual_seed(seed)
     pixels = torch.stack([rig(joints[:, p]).pixels for p in range(len(starts))], 2)
-    return rig, pixels + 3 * torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
+    return rig, noisy(pixels, 3.0, seed)
 
 
 def followed(rig, pixels):
@@ -244,8 +237,7 @@ def back_to_back(turn):
     joints[1][..., 2] += 0.6
     rig = ring(3)
     pixels = torch.stack([rig(one).pixels for one in joints], 2)
-    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0)).double()
-    return rig, torch.stack(joints, 1), pixels + 2 * noise
+    return rig, torch.stack(joints, 1), noisy(pixels, 2.0)
 
 
 def about_up(angle):
@@ -258,7 +250,7 @@ def test_two_persons_whom_one_camera_each_sees_stay_two(turn):
     rig, joints, pixels = back_to_back(turn)
     pixels[12:, 1:, 0] = math.nan
     pixels[12:, 0, 1] = pixels[12:, 2, 1] = math.nan
-    found = tracker(rig)(keypoints=pixels, persons="all")
+    found = kalman(rig)(keypoints=pixels, persons="all")
     assert [len(one) for one in found] == [T, T]
     off = [(one.joints3d - joints.movedim(1, 0)).norm(dim=-1).mean((1, 2)) for one in found]
     assert {int(each.argmin()) for each in off} == {0, 1}
@@ -271,13 +263,13 @@ def test_somebody_whom_another_camera_sees_does_not_move_a_person(turn):
     rig, joints, pixels = back_to_back(turn)
     pixels[10:, 1:, 0] = math.nan
     pixels[:20, :, 1] = pixels[:, 0, 1] = pixels[:, 2, 1] = math.nan
-    (found,) = tracker(rig)(keypoints=pixels, persons="all")
+    (found,) = kalman(rig)(keypoints=pixels, persons="all")
     assert len(found) == T and not found.respread.any()
     assert float((found.joints3d - joints[:, 0]).norm(dim=-1).mean()) < 0.1
 
 
 def test_persons_who_are_there_begin_anew_where_there_is_no_room_for_others():
-    people = tracker(ring(2)).by_keypoints.tracker
+    people = kalman(ring(2)).by_keypoints.tracker
     new = torch.tensor([True, False, True, True])
     assert PeopleTracker(people, 2)._has_room(new, 1).tolist() == [True, True, False, False]
     assert PeopleTracker(people, None)._has_room(new, 1).all()
@@ -287,7 +279,7 @@ def test_a_gap_of_who_enters_late_has_the_numbers_of_the_recording():
     rig, _, pixels = passing(2)
     still = pixels[5:6, :, :1].expand(50, -1, -1, -1, -1).clone()
     still[:10] = still[14:44] = math.nan
-    (found,) = tracker(rig)(keypoints=still, persons="all")
+    (found,) = kalman(rig)(keypoints=still, persons="all")
     assert (found.first_frame, len(found)) == (10, 40)
     assert any("in frames 14 to 43;" in note for note in found.notes)
 
@@ -298,14 +290,14 @@ def test_a_detection_of_nobody_and_a_double_make_no_person():
     false[5, 0] = pixels[5, 0, :1] + 400
     double = pixels[:, :, :1] + 2
     seen = torch.cat([pixels, false, double], 2)[:20]
-    found = tracker(rig)(keypoints=seen, persons="all")
+    found = kalman(rig)(keypoints=seen, persons="all")
     assert len(found) == 2
 
 
 def test_one_camera_tracks_two_persons_beside_each_other():
     rig, _, pixels = passing(1)
     apart = pixels[:10]  # before they cover each other
-    found = tracker(rig)(keypoints=shuffled(apart)[0], persons="all")
+    found = kalman(rig)(keypoints=shuffled(apart)[0], persons="all")
     assert [len(one) for one in found] == [10, 10]
     seen = torch.stack([rig(one.joints3d).pixels[-1, 0] for one in found])
     off = (seen[:, None] - apart[-1, 0]).norm(dim=-1).mean(-1)  # of tracks from persons
@@ -320,7 +312,7 @@ def test_assignment_is_the_best_of_all():
 @pytest.mark.parametrize("confidence", [0.1, 1.0])
 def test_who_is_behind_a_camera_wants_none_of_its_detections(confidence):
     rig, _, pixels = passing(3)
-    single = tracker(rig).by_keypoints
+    single = kalman(rig).by_keypoints
     trust = torch.full_like(pixels[0, ..., 0], confidence).transpose(0, 1)
     frame = single.reader.frames(pixels[0].transpose(0, 1), trust, None, None)
     state = single.tracker.advance(None, frame)[0].state
@@ -334,10 +326,10 @@ def test_bad_input_is_refused():
     rig, _, pixels = passing(2)
     for persons in ("some", 0, True):
         with pytest.raises(InputError, match="persons"):
-            tracker(rig)(keypoints=pixels, persons=persons)
+            kalman(rig)(keypoints=pixels, persons=persons)
     with pytest.raises(ShapeError):
-        tracker(rig)(keypoints=pixels[:, :, 0], persons="all")
+        kalman(rig)(keypoints=pixels[:, :, 0], persons="all")
     with pytest.raises(InputError, match="refine"):
-        tracker(rig)(keypoints=pixels, persons="all", refine="both")
+        kalman(rig)(keypoints=pixels, persons="all", refine="both")
     with pytest.raises(NobodySeenError):
-        tracker(rig)(keypoints=torch.full_like(pixels, math.nan), persons="all")
+        kalman(rig)(keypoints=torch.full_like(pixels, math.nan), persons="all")

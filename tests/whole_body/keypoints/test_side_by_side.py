@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-import torchpose
-from tests.whole_body.keypoints.scenes import FPS, NAMES, errors, moving_body, ring
+from tests.whole_body.keypoints.scenes import FPS, NAMES, errors, kalman, moving_body, ring, seen_by
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.metrics import coverage
@@ -35,16 +34,13 @@ def stereo(baseline, focal=1000.0):
 @pytest.fixture(scope="module")
 def noisy():
     """Joints, a rig and keypoints with 4 px of noise."""
-    joints, rig = moving_body(40, height=1.9), stereo(0.12)
-    pixels = rig(joints).pixels
-    generator = torch.Generator().manual_seed(0)
-    return joints, rig, pixels + 4 * torch.randn(pixels.shape, generator=generator).to(pixels)
+    return seen_by(stereo(0.12), moving_body(40, height=1.9))[:3]
 
 
 @pytest.fixture(scope="module")
 def track(noisy):
     _, rig, keypoints = noisy
-    return torchpose.BodyTracker(rig, "kalman", fps=FPS)(keypoints=keypoints, names=NAMES)
+    return kalman(rig)(keypoints=keypoints)
 
 
 def relative(joints):
@@ -53,8 +49,8 @@ def relative(joints):
 
 def test_two_cameras_side_by_side_are_no_worse_than_one(noisy, track):
     joints, rig, keypoints = noisy
-    alone = torchpose.BodyTracker(rig.select([0]), "kalman", fps=FPS)
-    by_one = alone(keypoints=keypoints[:, :1], names=NAMES)
+    alone = kalman(rig.select([0]))
+    by_one = alone(keypoints=keypoints[:, :1])
     assert float(errors(track, joints).mean()) < float(errors(by_one, joints).mean())
     two, one = (
         float((relative(x.joints3d) - relative(joints)).norm(dim=-1).mean())
@@ -91,10 +87,10 @@ def test_ellipsoids_from_the_pelvis_hold_the_joints_and_not_the_place(noisy, tra
 
 def test_live_poses_are_those_of_the_recording(noisy, track):
     _, rig, keypoints = noisy
-    tracker = torchpose.BodyTracker(rig, "kalman", fps=FPS)
+    tracker = kalman(rig)
     stream = tracker.init()
     for t in range(4):
-        stream, pose = tracker.step(stream, keypoints=keypoints[t], names=NAMES)
+        stream, pose = tracker.step(stream, keypoints=keypoints[t])
         torch.testing.assert_close(pose.joints3d[0], track.joints3d[t])
         live, whole = (x.details["covariance_from_pelvis"] for x in (pose, track))
         torch.testing.assert_close(live[0], whole[t])
@@ -104,7 +100,7 @@ def test_one_of_the_two_alone_is_followed_until_the_other_is_back(noisy):
     joints, rig, keypoints = noisy
     hidden = keypoints[:30].clone()
     hidden[:20, 1] = torch.nan
-    poses = torchpose.BodyTracker(rig, "kalman", fps=FPS)(keypoints=hidden, names=NAMES)
+    poses = kalman(rig)(keypoints=hidden)
     spread = poses.details["covariance_from_pelvis"][:, LEGS].diagonal(dim1=-2, dim2=-1).sum((1, 2))
     assert spread[0] > spread[-1]
     apart = relative(poses.joints3d) - relative(joints[poses.first_frame : 30])
