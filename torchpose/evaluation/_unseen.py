@@ -17,6 +17,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.frame_rates import group_by_rate
+from torchpose._core.rows import joined
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
 from torchpose.evaluation._person_recordings import LEAST_FRAMES, complete_pieces, pose_classes
@@ -93,7 +94,7 @@ class Scored(NamedTuple):
 
 def pooled(parts: Sequence[Scored]) -> Scored:
     """Return all frames of several persons, or of several frame rates, as one."""
-    return Scored(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return joined(parts)
 
 
 @dataclass(frozen=True)

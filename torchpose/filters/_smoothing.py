@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose._core.value_checks import values_visible
 from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._measurements import Measurements
@@ -80,16 +81,12 @@ def smooth_fixed_tracks(
     outputs = []
     for first in range(0, batch, part):
         rows = slice(first, first + part)
-        noise = frames.cov if frames.cov.ndim == 2 else frames.cov[rows]
-        piece = Measurements(frames.z[rows], frames.mask[rows], noise, frames.lengths[rows])
-        outputs.append(_smooth(model, rule, piece, lag, return_cov))
-    mean = torch.cat([out[0] for out in outputs])
-    log_weights = torch.cat([out[1] for out in outputs])
-    evidence = torch.cat([out[2] for out in outputs])
-    parts = [out[3] for out in outputs if out[3] is not None]
-    cov = torch.cat(parts) if parts else None
-    work = Mending(*(torch.cat(part) for part in zip(*(out[4] for out in outputs), strict=True)))
-    return finish_output(mean, log_weights, evidence, cov, frames.lengths, work)
+        outputs.append(_smooth(model, rule, frames.some(rows), lag, return_cov))
+    mean, log_weights, evidence, covs, work = zip(*outputs, strict=True)
+    return finish_output(
+        joined(mean), joined(log_weights), joined(evidence), joined(covs) if return_cov else None,
+        frames.lengths, joined(work),
+    )  # fmt: skip
 
 
 def _smooth(

@@ -9,6 +9,7 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_finite, check_shape
+from torchpose._core.rows import joined
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
@@ -284,7 +285,7 @@ def _statistics(gmm: GaussianMixture, earlier: Tensor, later: Tensor, moved: int
                 constant - 0.5 * rest,
             )
         )
-    return _Pairs(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return joined(parts)
 
 
 def _log_terms(pairs: _Pairs, gamma: Tensor, moved: int) -> Tensor:

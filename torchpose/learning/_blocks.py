@@ -9,8 +9,9 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose.errors import InputError
-from torchpose.learning._samplers import BLOCK, PRODUCT, Samples, SampleSource, join_samples
+from torchpose.learning._samplers import BLOCK, PRODUCT, Samples, SampleSource
 
 K = TypeVar("K")
 _START_BLOCKS = 4  # times the blocks that the samples would fill, for variety
@@ -129,7 +130,7 @@ def spread_samples(source: SampleSource, count: int) -> Samples:
         parts.append(samples)
     if not parts:
         return Samples(torch.zeros(0, source.dim).double(), torch.zeros(0).double())
-    return join_samples(parts)
+    return joined(parts)
 
 
 def usable_block(source: SampleSource, index: int, epoch: int = 0) -> Samples:
@@ -148,12 +149,12 @@ def joined_blocks(blocks: Iterable[tuple[K, Samples]]) -> Iterator[tuple[K, Samp
     last: list[K] = []
     for key, samples in blocks:
         if kept and last != [key]:
-            yield last[0], join_samples(kept)
+            yield last[0], joined(kept)
             kept = []
         last = [key]
         kept.append(samples)
         if sum(len(s.states) for s in kept) >= PRODUCT:
-            yield key, join_samples(kept)
+            yield key, joined(kept)
             kept = []
     if kept:
-        yield last[0], join_samples(kept)
+        yield last[0], joined(kept)

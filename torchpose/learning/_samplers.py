@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
+from torchpose._core.rows import joined
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError
 from torchpose.priors._arm_state import arm_state
@@ -35,11 +36,6 @@ class Samples(NamedTuple):
 
     states: Float[Tensor, "N D"]
     weight: Float[Tensor, " N"]
-
-
-def join_samples(parts: Sequence[Samples]) -> Samples:
-    """Join the samples of all parts."""
-    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 @runtime_checkable
@@ -68,7 +64,7 @@ class SampleSource(Protocol):
 
 def all_samples(source: SampleSource) -> Samples:
     """Return every state of a source."""
-    return join_samples([source.block(index) for index in range(source.n_blocks)])
+    return joined([source.block(index) for index in range(source.n_blocks)])
 
 
 def derived_seed(seed: int, purpose: str) -> int:

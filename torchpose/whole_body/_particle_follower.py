@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_shape
 from torchpose._core.module_state import derived
+from torchpose._core.rows import joined
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
@@ -27,7 +28,6 @@ from torchpose.whole_body._first_pose import find_first_pose
 from torchpose.whole_body._following import Observed, all_see, follow
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
-from torchpose.whole_body._keypoints.nested import joined
 from torchpose.whole_body._measured_keypoints import (
     BodyKeypointMeasurer,
     GivenKeypoints,

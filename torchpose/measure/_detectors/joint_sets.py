@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import torch
 
+from torchpose._core.rows import joined
 from torchpose.errors import InputError
 from torchpose.measure._detectors.protocol import Detections
 from torchpose.skeleton._joint_sets import COCO
@@ -71,4 +72,4 @@ def select_joints(found: Detections, joints: JointSet) -> Detections:
     wrists = points[:, _WRISTS]
     hands = wrists + _HAND * (points[:, _KNUCKLES] - wrists)
     sure = torch.minimum(confidence[:, _WRISTS], confidence[:, _KNUCKLES])
-    return Detections(*(torch.cat(pair, 1) for pair in zip(first, (hands, sure), strict=True)))
+    return joined([first, Detections(hands, sure)], 1)

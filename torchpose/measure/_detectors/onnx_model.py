@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
+from torchpose._core.rows import joined
 from torchpose.measure._detectors.joint_sets import select_joints
 from torchpose.measure._detectors.layouts import Layout, as_tensors, find_layout
 from torchpose.measure._detectors.networks import Network, image_input, open_network
@@ -57,7 +58,7 @@ class CroppingOnnxModel(OnnxModel):
         if boxes is None:
             boxes = whole(image)[None]
         found = [self._detect(image, box) for box in boxes]
-        return Detections(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+        return joined(found)
 
 
 def load_onnx(path: Path) -> OnnxModel:

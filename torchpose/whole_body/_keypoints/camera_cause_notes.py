@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose.camera._lens import distort_rays
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._keypoints.camera_causes import (
@@ -25,7 +26,6 @@ from torchpose.whole_body._keypoints.camera_causes import (
 from torchpose.whole_body._keypoints.coarse_delays import shifted
 from torchpose.whole_body._keypoints.faulty_cameras import without_still_frames
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
-from torchpose.whole_body._keypoints.nested import joined
 
 _FRAMES = 30  # at most, that are looked at
 _LEAST_KEYPOINTS = 100  # of joints that two cameras see

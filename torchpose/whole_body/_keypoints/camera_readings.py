@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose.camera._rig import CameraRig
 from torchpose.whole_body._keypoints.camera_conventions import (
     WELL_OF_TWO,
@@ -22,7 +23,6 @@ from torchpose.whole_body._keypoints.camera_order import (
 )
 from torchpose.whole_body._keypoints.joint_triangulation import agreeing, agreement
 from torchpose.whole_body._keypoints.keypoint_likelihood import Exchange, KeypointFrame, RigMaps
-from torchpose.whole_body._keypoints.nested import joined
 
 _FEW = 0.7  # share of a camera's keypoints that agree, below which its pose may be one of another convention
 _MORE_OF_TWO = 0.3  # by how much two cameras agree better by another pose of one of them

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, with_sides_exchanged
 from torchpose.whole_body._keypoints.keypoint_start import FEW_HEADINGS, start
-from torchpose.whole_body._keypoints.nested import joined
 
 # Values of `frames_lost`: in the second frame of exchanged sides, and every third after it.
 _FIRST, _EVERY = 1.0, 1.5

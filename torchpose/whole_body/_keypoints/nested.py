@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpose._core.rows import joined
+
 PART = 256
 """Frames of a long recording that are worked on at once; what that needs for all would fill the memory."""
 
@@ -57,11 +59,6 @@ def replaced(value: Any, index: Tensor, other: Any) -> Any:
 def stacked(frames: Sequence[Any]) -> Any:
     """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
     return mapped(lambda *values: torch.stack(values, 1), *frames)
-
-
-def joined(parts: Sequence[Any], dim: int = 0) -> Any:
-    """Return tensors, or named tuples of tensors, put one after the other along a dimension."""
-    return mapped(lambda *values: torch.cat(values, dim), *parts)
 
 
 def part_of(value: Any, rows: slice, dim: int = 1) -> Any:

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_choice, check_shape
+from torchpose._core.rows import joined
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._keypoints.camera_conventions import check_conventions
@@ -23,7 +24,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import notes_on_strays
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import to_be_smoothed
-from torchpose.whole_body._keypoints.nested import FrameCollector, joined, one_of, stacked, taken
+from torchpose.whole_body._keypoints.nested import FrameCollector, one_of, stacked, taken
 from torchpose.whole_body._keypoints.people_association import (
     pairs_of_detections,
     taken_detections,

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose.whole_body._keypoints.begin_anew import sees_enough
 from torchpose.whole_body._keypoints.body_kalman import CorrectedBody
 from torchpose.whole_body._keypoints.faulty_cameras import (
@@ -26,7 +27,7 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
-from torchpose.whole_body._keypoints.nested import joined, mapped, taken
+from torchpose.whole_body._keypoints.nested import mapped, taken
 from torchpose.whole_body._keypoints.people_association import owned_detections
 from torchpose.whole_body._keypoints.people_turns import turns_of_all
 from torchpose.whole_body._keypoints.turn_looks import TurnLooks, side_by_side
