@@ -83,7 +83,7 @@ class BodyKeypointMeasurer:
             ShapeError, InputError, CameraError: as `BodyTracker.forward`.
         """
         check_shape("keypoints", given.keypoints, ["T", len(self.tracker.rig), None, 2])
-        return self.tracker.reader.frames(*given)
+        return self.tracker.reader.frames_and_feet(*given)[0]
 
     def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
         """Return the measurement of one frame, of one element."""

@@ -310,10 +310,6 @@ def _heading_of(up: Tensor, facing: Tensor) -> Tensor:
     return torch.atan2(torch.linalg.cross(ahead, facing) @ up, ahead @ facing)
 
 
-def _is_manifold(prior: Any) -> bool:
-    return hasattr(prior, "pose_mean") and hasattr(prior, "to_latent")
-
-
 def _draw_poses(
     body: Any, prior: Any, batch: int, n: int, generator: Generators, like: Tensor
 ) -> Float[Tensor, "B N Q"]:
@@ -322,7 +318,7 @@ def _draw_poses(
     if prior is None:
         return _PART * noise
     rows = uniform(batch, (n,), generator, like)
-    if _is_manifold(prior):
+    if hasattr(prior, "pose_mean") and hasattr(prior, "to_latent"):
         prior.check_for(body)
         points = prior.latents
         chosen = points[(rows * len(points)).long().clamp_max(len(points) - 1)]

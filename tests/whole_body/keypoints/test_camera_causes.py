@@ -51,7 +51,7 @@ def wide():
 
 
 def frames_of(rig: CameraRig, keypoints) -> KeypointFrame:
-    return KeypointBodyTracker(rig, FPS).reader.frames(keypoints, None, NAMES, None)
+    return KeypointBodyTracker(rig, FPS).reader.frames_and_feet(keypoints, None, NAMES, None)[0]
 
 
 def cause_of(rig: CameraRig, keypoints) -> CameraCause | None:

@@ -109,7 +109,7 @@ def test_right_cameras_with_errors_are_not_refused(seen):
         (seen.rig, seen.keypoints + noise), (turned, seen.keypoints), (seen.rig, late), (seen.rig, few),
     ):  # fmt: skip
         single = KeypointBodyTracker(rig, FPS)
-        single.check_cameras(single.reader.frames(keypoints[None], None, NAMES, None))
+        single.check_cameras(single.reader.frames_and_feet(keypoints[None], None, NAMES, None)[0])
 
 
 def test_an_order_that_is_wrong_is_said_where_several_fit():
@@ -117,10 +117,10 @@ def test_an_order_that_is_wrong_is_said_where_several_fit():
     rig = ring(4)
     single = KeypointBodyTracker(rig, FPS)
     keypoints = rig(moving_body(20)).pixels
-    frames = single.reader.frames(keypoints[:, [3, 2, 1, 0]], None, NAMES, None)
+    frames = single.reader.frames_and_feet(keypoints[:, [3, 2, 1, 0]], None, NAMES, None)[0]
     (note,) = notes_on_order(rig.names, single.tracker.filter.maps, frames)
     assert "another order" in note
-    right = single.reader.frames(keypoints, None, NAMES, None)
+    right = single.reader.frames_and_feet(keypoints, None, NAMES, None)[0]
     assert notes_on_order(rig.names, single.tracker.filter.maps, right) == ()
 
 

@@ -323,7 +323,9 @@ def test_another_order_of_the_inputs_is_said(order):
 
 
 def test_other_readings_are_tried_only_where_they_can_be_better(three, monkeypatch):
-    given = KeypointBodyTracker(three.rig, FPS).reader.frames(three.keypoints, None, NAMES, None)
+    given = KeypointBodyTracker(three.rig, FPS).reader.frames_and_feet(
+        three.keypoints, None, NAMES, None
+    )[0]
     maps, tried = RigMaps.of(three.rig), []
     assert agree_as_given(maps, given)
     assert not agree_as_given(maps, given._replace(pixels=given.pixels[:, [1, 0, 2]]))
@@ -360,7 +362,7 @@ def test_one_mirrored_camera_is_said(cameras, exchanged):
 def test_sides_that_are_exchanged_in_all_cameras_are_said(cameras):
     seen = scene(cameras, n_frames=8)
     single = KeypointBodyTracker(seen.rig, FPS)
-    frames = single.reader.frames(seen.keypoints, seen.confidence, NAMES, None)
+    frames = single.reader.frames_and_feet(seen.keypoints, seen.confidence, NAMES, None)[0]
     filter = single.tracker.filter
     assert notes_on_all_sides(filter, frames) == ()
     nobody = frames._replace(inlier=0 * frames.inlier)
@@ -385,7 +387,7 @@ def test_right_and_turned_cameras_are_not_called_mirrored(three):
     turned_rig = with_turn(three.rig, 1, 20.0)
     for rig, keypoints in ((three.rig, three.keypoints), (three.rig, behind), (turned_rig, behind)):
         single = KeypointBodyTracker(rig, FPS)
-        frames = single.reader.frames(keypoints, None, NAMES, None)
+        frames = single.reader.frames_and_feet(keypoints, None, NAMES, None)[0]
         maps = single.tracker.filter.maps
         assert notes_on_one_camera(rig, maps, frames, filter.exchange) == ()
 

@@ -338,7 +338,7 @@ def test_derivatives_of_feet_are_those_of_differences(tracked):
     generator = torch.Generator().manual_seed(0)
     body = tracker.tracker.filter
     shown = scene(2, 1)
-    frame = tracker.reader.frames(shown.keypoints, None, NAMES, None)
+    frame = tracker.reader.frames_and_feet(shown.keypoints, None, NAMES, None)[0]
     _, pose, _ = tracker.tracker.advance(None, frame)
     legs = filter.legs(pose)
     mean = 0.1 * torch.randn(1, 2, N_FOOT, generator=generator, dtype=torch.float64)
@@ -357,7 +357,7 @@ def test_derivatives_of_feet_are_those_of_differences(tracked):
 
 def test_the_rotation_of_a_shank_is_as_unsure_as_its_joints_say():
     tracker = kalman(ring(2)).by_keypoints
-    frame = tracker.reader.frames(scene(2, 1).keypoints, None, NAMES, None)
+    frame = tracker.reader.frames_and_feet(scene(2, 1).keypoints, None, NAMES, None)[0]
     _, pose, _ = tracker.tracker.advance(None, frame)
     filter, body = tracker.feet, tracker.tracker.filter.articulation
     legs = filter.legs(pose)

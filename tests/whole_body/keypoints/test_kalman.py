@@ -1049,6 +1049,6 @@ def test_a_keypoint_that_is_of_no_ray_is_missing():
     camera = PinholeCamera(900, 900, 959.5, 539.5, 1920, 1080, distortions=(-0.35,))
     keypoints = torch.full((1, 1, 15, 2), 600.0).double()
     keypoints[0, 0, 3] = torch.tensor([1900.0, 1000.0])
-    frame = kalman(camera).by_keypoints.reader.frames(keypoints, None, None, None)
+    frame = kalman(camera).by_keypoints.reader.frames_and_feet(keypoints, None, None, None)[0]
     assert (frame.inlier[0, 0] > 0).tolist() == [j != 3 for j in range(15)]
     assert bool(frame.pixels.isfinite().all())

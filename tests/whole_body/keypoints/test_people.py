@@ -314,7 +314,7 @@ def test_who_is_behind_a_camera_wants_none_of_its_detections(confidence):
     rig, _, pixels = passing(3)
     single = kalman(rig).by_keypoints
     trust = torch.full_like(pixels[0, ..., 0], confidence).transpose(0, 1)
-    frame = single.reader.frames(pixels[0].transpose(0, 1), trust, None, None)
+    frame = single.reader.frames_and_feet(pixels[0].transpose(0, 1), trust, None, None)[0]
     state = single.tracker.advance(None, frame)[0].state
     behind = state.mean.position - 1.4 * rig.rotation[0].T @ rig.translation[0]
     moved = state._replace(mean=state.mean._replace(position=behind))

@@ -76,13 +76,15 @@ _CARRIED = 0.3  # metres in a second, standard deviation, of a pelvis of which n
 _HELD_TRUNK = 20.0  # shares of the information about the lean of its trunk that such a body gets
 _HELD_PELVIS = 2.0  # shares of that about the lean of its pelvis
 _NO_DOUBT = -12.0
-# Factors of the noise where a joint has jumped.
+# Factors of the noise's variance in each iteration, and where a joint has jumped.
+_USUAL_WIDTHS = (1.0, 1.0, 1.0)
 _RECOVERY = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0, 1.5, 1.0)
 _DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
 _SCALE_TIME = 2.0  # seconds over which the factors of the cameras' noise are averaged
 _WIDTHS = (1.0, 4.0, 16.0, 64.0)  # factors of the noise that are tried for cameras with few inliers
 _SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
-_HIPS = tuple(BODY_15.joint(name) for name in ("pelvis", "left_hip", "right_hip"))
+HIPS = tuple(BODY_15.joint(name) for name in ("pelvis", "left_hip", "right_hip"))
+"""The pelvis and both hips."""
 
 
 class BodyGaussian(NamedTuple):
@@ -167,7 +169,7 @@ class BodyKalmanFilter(nn.Module):
     """Filters Gaussians over body states from keypoints in C cameras.
 
     Args:
-        motion: how bodies move. rig: the cameras. fps: frames per second. n_iterations: of a correction.
+        motion: how bodies move. rig: the cameras. fps: frames per second.
         up: "y" or "z", the axis of the world that points up; without it one camera is taken to be level.
     """
 
@@ -176,11 +178,10 @@ class BodyKalmanFilter(nn.Module):
         motion: BodyMotion,
         rig: CameraRig,
         fps: float,
-        n_iterations: int = 3,
         up: str | None = None,
     ) -> None:
         super().__init__()
-        self.motion, self.fps, self.n_iterations, self.up = motion, fps, n_iterations, up
+        self.motion, self.fps, self.up = motion, fps, up
         self.articulation = motion.articulation
         self._rig = (rig,)  # a tuple, so that its tensors are held once
         upright_of(rig, up)  # raises errors of the axis before any work
@@ -319,7 +320,7 @@ class BodyKalmanFilter(nn.Module):
         expected to decay, and the trunk would lean over more and more.
         """
         seen = frame.there.any(1)
-        hips = index_tensor(_HIPS, seen.device)
+        hips = index_tensor(HIPS, seen.device)
         rows = seen.any(-1) & ~seen.index_select(-1, hips).any(-1) & (len(self.maps.shift) > 1)
         return rows.nonzero().squeeze(-1)
 
@@ -346,7 +347,7 @@ class BodyKalmanFilter(nn.Module):
         found = self._linearised(state, state.mean, readings)
         doubt, jumped, agreed = self._doubts(state, readings, found)
         state = state._replace(doubt=doubt, agreed=agreed)
-        corrected = self._iterated(state, readings, (1.0,) * self.n_iterations, found)
+        corrected = self._iterated(state, readings, _USUAL_WIDTHS, found)
         rows = jumped.any(-1).nonzero().squeeze(-1)
         if not len(rows):
             return corrected

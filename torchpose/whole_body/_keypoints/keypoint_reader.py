@@ -46,16 +46,6 @@ class KeypointReader:
             )
         self.rig, self.keypoint_std, self.pixel_std = rig, keypoint_std, pixel_std
 
-    def frames(
-        self,
-        keypoints: Tensor,
-        confidence: Tensor | None,
-        names: Sequence[str] | None,
-        covariance: Tensor | None,
-    ) -> KeypointFrame:
-        """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
-        return self.frames_and_feet(keypoints, confidence, names, covariance)[0]
-
     def frames_and_feet(
         self,
         keypoints: Tensor,
@@ -63,7 +53,10 @@ class KeypointReader:
         names: Sequence[str] | None,
         covariance: Tensor | None,
     ) -> tuple[KeypointFrame, KeypointFrame | None]:
-        """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them."""
+        """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them.
+
+        They are undistorted, with their noise and trust.
+        """
         refuse_half("keypoints", keypoints)
         names = _names_of(keypoints, names)
         shape = keypoints.shape[:-1]

@@ -91,7 +91,7 @@ class KeypointTracker(nn.Module):
     """Tracks bodies through frames of keypoints with a `BodyKalmanFilter`.
 
     Args:
-        rig: the cameras. fps: frames per second. motion: how bodies move. n_iterations: of a correction.
+        rig: the cameras. fps: frames per second. motion: how bodies move.
         up: "y" or "z", the axis of the world that points up; without it one camera is taken to be level.
         lasting_std: metres, of what is wrong with joints for so long that frames do not average it out, along
             each axis; covariances of joints have it on top.
@@ -106,7 +106,6 @@ class KeypointTracker(nn.Module):
         rig: CameraRig,
         fps: float,
         motion: BodyMotion,
-        n_iterations: int = 3,
         up: str | None = None,
         lasting_std: float = 0.0,
         lone: LoneNoise = SAME_NOISE,
@@ -117,7 +116,7 @@ class KeypointTracker(nn.Module):
         self.lone, self.size_std = lone, size_std
         self._rig = (rig,)  # a tuple, so that its tensors are held once
         self.lifter = PoseLifter(rig, fps, motion, up) if are_side_by_side(rig) else None
-        self.filter = BodyKalmanFilter(motion, rig, fps, n_iterations, up)
+        self.filter = BodyKalmanFilter(motion, rig, fps, up)
         stereo = len(rig) > 1 and self.lifter is not None
         self.poses = PoseMaker(self.filter, stereo, lasting_std, lone.lasting_std)
         self.only = OnlyCamera(self.filter, camera_height, lasting_std) if size_std > 0 else None
@@ -353,9 +352,7 @@ class KeypointTracker(nn.Module):
 
         def make() -> KeypointTracker:
             motion, device = of_one_camera(filter.motion), rig.matrix.device
-            own = KeypointTracker(
-                rig.select([camera]), filter.fps, motion, filter.n_iterations, filter.up
-            )
+            own = KeypointTracker(rig.select([camera]), filter.fps, motion, filter.up)
             return own.to(device)  # the network that lifts, too
 
         return derived(self, ("alone", camera), (*rig.buffers(), *filter.motion.buffers()), make)

@@ -39,8 +39,8 @@ from torchpose.priors._lifting_network import (
     lifting_features,
     shipped_lifting_network,
 )
-from torchpose.whole_body._keypoints.begin_anew import sees_most
-from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
+from torchpose.whole_body._keypoints.begin_anew import sees_enough, sees_most
+from torchpose.whole_body._keypoints.body_kalman import HIPS, BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll, turn_upright
 from torchpose.whole_body._keypoints.information_step import plus_one
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
@@ -53,7 +53,6 @@ from torchpose.whole_body._keypoints.upright import LEGS, camera_up, upright_of
 _FACTOR = 1.5
 _CONTRADICTION = 1.0  # mean square of e_j / (1.5 s_j): usually 0.1, and 1 in one frame of a hundred
 _ITERATIONS = 2
-_LEAST_JOINTS = 6  # keypoints without which a frame is not lifted
 _SIDE_BY_SIDE = 1.0  # metres between cameras, up to which their keypoints are lifted
 _TELLING = math.radians(7.0)  # a_0, chosen on the fitted persons of `benchmarks.keypoint_bodies`
 _PASSES, _CLOSE = 4, 0.1  # metres, from where on the error of a ray counts less
@@ -61,7 +60,7 @@ _NEAREST = 0.5  # metres from the camera
 _LEAST_UP = 0.2  # share of the upward direction in the image plane, below which it tells no roll
 _PELVIS = BODY_15.joint("pelvis")
 _NECK = BODY_15.joint("neck")
-_HIDDEN = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip"), *LEGS]
+_HIDDEN = [*HIPS, *LEGS]
 _REMEMBERED = 1.0  # seconds for which legs are expected as they were seen
 _USUAL_SHARE = 10.0  # of the information about usual legs, afterwards, against that of the priors
 _OTHERS = [j for j in range(len(BODY_15.names)) if j != _PELVIS]
@@ -157,7 +156,7 @@ class PoseLifter(nn.Module):
         each = mapped(lambda value: value.unflatten(0, sure.shape[:2]), self._by_camera(*flat))
         (joints, std), memory = each
         joints = self._without_lean(joints, rays, sure, memory.roll)
-        enough = ((sure > 0.0).sum(-1, keepdim=True) >= _LEAST_JOINTS).to(rays)
+        enough = sees_enough(frame)[..., None].to(rays)
         share = enough / enough.sum(1, keepdim=True).clamp_min(1)
         mean = (share[..., None] * (joints @ self.view.rotation)).sum(1)
         std = torch.where(share.sum(1) > 0.0, (share * std).sum(1), torch.inf)

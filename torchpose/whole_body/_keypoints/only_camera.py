@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpose.body._articulation import covariances_of
 from torchpose.body._feet import ANKLES
 from torchpose.body._skeleton import BODY_15
-from torchpose.whole_body._keypoints.body_kalman import BodyKalmanFilter
+from torchpose.whole_body._keypoints.body_kalman import HIPS, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_size import (
     Floor,
     outer,
@@ -37,7 +37,6 @@ from torchpose.whole_body._keypoints.nested import mapped
 LASTING = 1.25
 _LASTING_UNSEEN, _FORGOTTEN = 2.5, 0.5  # seconds
 _PELVIS, _NECK = BODY_15.joint("pelvis"), BODY_15.joint("neck")
-_MIDDLE = [_PELVIS, BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
 
 
 class OnlyCamera:
@@ -170,7 +169,7 @@ def _shares_and_variances(
 ) -> tuple[Float[Tensor, "*batch J"], Float[Tensor, "*batch J"]]:
     """Return u_j and (2.5 s_j)^2."""
     unseen = poses.unseen.clone()
-    unseen[..., _PELVIS] = unseen[..., _MIDDLE].amin(-1)
+    unseen[..., _PELVIS] = unseen[..., HIPS].amin(-1)
     return -torch.expm1(-unseen / _FORGOTTEN), (_LASTING_UNSEEN * poses.spread).square()
 
 
