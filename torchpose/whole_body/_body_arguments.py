@@ -1,19 +1,53 @@
 """Check what `BodyTracker` is given: arguments that its method does not use are refused."""
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 from jaxtyping import Integer
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
+from torchpose.body._kinematics import Body
 from torchpose.errors import InputError
+from torchpose.whole_body._filter_table import choose_method
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 
 
 def given_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments that are not None."""
     return {name: value for name, value in arguments.items() if value is not None}
+
+
+def check_kind(name: str, value: object, kind: type) -> None:
+    """Raise `InputError` unless an argument is None, of a kind, or the name of a file."""
+    if not isinstance(value, kind | str | Path | None):
+        raise InputError(
+            f"{name} must be a {kind.__name__} or the name of its file, got {type(value).__name__}"
+        )
+
+
+def check_person(body: object, height: object) -> None:
+    """Raise `InputError` unless a body is one, or the name of its file, and no height is given beside it."""
+    if body is not None and height is not None:
+        raise InputError(
+            "height does nothing beside body, whose bones tell it; leave one of them out"
+        )
+    check_kind("body", body, Body)
+
+
+def method_for(
+    method: str | None,
+    models: Collection[str],
+    of_kalman: Collection[str],
+    of_particles: Collection[str],
+) -> str:
+    """Return the method that tracks with what is given; raise `InputError` for what it does not use."""
+    if method == KEYPOINT_METHOD:
+        refuse([*models, *of_particles], f"for method {method}")
+        return method
+    refuse(of_kalman, f"without method={KEYPOINT_METHOD!r}")
+    return choose_method(method, models)
 
 
 def refuse(unused: Collection[str], where: str) -> None:

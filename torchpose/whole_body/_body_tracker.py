@@ -24,17 +24,19 @@ from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
-from torchpose.priors._shipped import load_body_motion
 from torchpose.whole_body._body_arguments import (
     check_facing,
     check_filters_one,
+    check_kind,
     check_not_refined,
+    check_person,
     given_of,
     keypoints_alone,
+    method_for,
     refuse,
 )
 from torchpose.whole_body._body_track import BodyTrack, load_body
-from torchpose.whole_body._filter_table import BodyTrackerOptions, choose_method
+from torchpose.whole_body._filter_table import BodyTrackerOptions
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._following import Observed
@@ -43,7 +45,7 @@ from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTr
 from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
 from torchpose.whole_body._measured_keypoints import given_keypoints
-from torchpose.whole_body._particle_follower import set_up_particles
+from torchpose.whole_body._particle_follower import ParticleFollower, set_up_particles
 
 _N_PARTICLES = 1000
 
@@ -168,26 +170,18 @@ class BodyTracker(OwnPrecisionModule):
     ) -> None:
         super().__init__()
         check_rate("fps", fps)
-        if body is not None and height is not None:
-            raise InputError(
-                "height does nothing beside body, whose bones tell it; leave one of them out"
-            )
-        _check_kind("body", body, Body)
-        _check_kind("motion", motion, BodyMotion)
+        check_person(body, height)
+        check_kind("motion", motion, BodyMotion)
         given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
-        of_kalman = {"motion": motion, "up": up, "camera_height": camera_height}
+        of_kalman = given_of({"motion": motion, "up": up, "camera_height": camera_height})
+        of_particles = given_of({
+            "process_cov": process_cov, "initial_cov": initial_cov,
+            "n_particles": None if n_particles == _N_PARTICLES else n_particles,
+        })  # fmt: skip
         rig = as_rig(cameras)
         check_room(rig)
-        if method == KEYPOINT_METHOD:
-            of_particles = {
-                "process_cov": process_cov, "initial_cov": initial_cov,
-                "n_particles": None if n_particles == _N_PARTICLES else n_particles,
-            }  # fmt: skip
-            refuse([*given, *options, *given_of(of_particles)], f"for method {method}")
-        else:
-            refuse(given_of(of_kalman), f"without method={KEYPOINT_METHOD!r}")
-            method = choose_method(method, given)
-        self.method, self.fps = method, float(fps)
+        method = method_for(method, given, of_kalman, [*options, *of_particles])
+        self.method, self.fps, self.cameras = method, float(fps), rig
         self.notes: tuple[str, ...] = ()
         person = body if body is None or isinstance(body, Body) else load_body(body)
         self._settings = settings_of({
@@ -198,21 +192,23 @@ class BodyTracker(OwnPrecisionModule):
         })  # fmt: skip
         self.by_keypoints: KeypointBodyTracker | None = None
         if method == KEYPOINT_METHOD:
-            self.cameras, self.n_particles = rig, 0
+            self.n_particles = 0
             self.by_keypoints = KeypointBodyTracker(
-                rig, fps, body=person, height=height,
-                motion=load_body_motion(motion) if isinstance(motion, str | Path) else motion,
-                keypoint_std=keypoint_std, pixel_std=pixel_std, up=up, camera_height=camera_height,
+                rig, fps, body=person, height=height, keypoint_std=keypoint_std,
+                pixel_std=pixel_std, **of_kalman,
             )  # fmt: skip
             return
+        self.n_particles = n_particles
         self._by_particles = set_up_particles(
             method, rig, given, person, height, self.fps, n_particles,
             {**options, **given_of({"process_cov": process_cov})}, (keypoint_std, pixel_std),
         )  # fmt: skip
-        self.filter, self.notes = self._by_particles.filter, self._by_particles.notes
-        self.cameras, self.n_particles = rig, n_particles
-        # registered, so that they move with the tracker
-        self._upright, self._search = self._by_particles.start_body, self._by_particles.start_prior
+        self._register(self._by_particles, initial_cov)
+
+    def _register(self, follower: ParticleFollower, initial_cov: Tensor | None) -> None:
+        """Hold what is to move with the tracker."""
+        self.filter, self.notes = follower.filter, follower.notes
+        self._upright, self._search = follower.start_body, follower.start_prior
         std = None
         if initial_cov is not None:
             std = std_of_covariance("initial_cov", initial_cov, self.body.dim)
@@ -312,11 +308,9 @@ class BodyTracker(OwnPrecisionModule):
         if self.by_keypoints is not None:
             check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
             keypoints = keypoints_alone(self.method, silhouettes, keypoints)
-            others = {
-                "initial_state": initial_state, "generator": generator, "facing": facing,
-                "n_frames": n_frames,
-            }  # fmt: skip
-            refuse(given_of(others), f"for method {self.method}")
+            self._refuse_given(
+                initial_state=initial_state, generator=generator, facing=facing, n_frames=n_frames
+            )
             options: dict[str, Any] = {
                 "covariance": covariance, "smoothing": smoothing, "progress": progress
             }  # fmt: skip
@@ -372,11 +366,10 @@ class BodyTracker(OwnPrecisionModule):
             use. ShapeError, CameraError: as `forward`.
         """
         if self.by_keypoints is not None:
-            others = {
-                "silhouettes": silhouettes, "initial_state": initial_state, "generator": generator,
-                "facing": facing,
-            }  # fmt: skip
-            refuse(given_of(others), f"for method {self.method}")
+            self._refuse_given(
+                silhouettes=silhouettes, initial_state=initial_state, generator=generator,
+                facing=facing,
+            )  # fmt: skip
             return BodyStream(None, 0, None, _names(names), self._settings)
         check_facing(facing, initial_state, keypoints)
         if initial_state is None:
@@ -494,7 +487,7 @@ class BodyTracker(OwnPrecisionModule):
             one frame at a time, by `step`.
         """
         names = self._stream_names(state, names)
-        if self.by_keypoints is not None or not isinstance(state.filter, BodyFilterState):
+        if self.by_keypoints is not None:
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
         return self._tracked(state, self._by_particles.observed(silhouettes, given)[0])
@@ -519,6 +512,10 @@ class BodyTracker(OwnPrecisionModule):
                 f"{self.method} and {len(self.cameras)} cameras"
             )
         return find_camera_tilt(tracks, self.cameras)
+
+    def _refuse_given(self, **arguments: Any) -> None:
+        """Raise `InputError` for arguments, but None, that the method does not use."""
+        refuse(given_of(arguments), f"for method {self.method}")
 
     def _stream_names(self, state: BodyStream, names: Sequence[str] | None) -> Sequence[str] | None:
         """Return the names of a frame's keypoints: those given with it, else those given at first.
@@ -545,14 +542,6 @@ class BodyTracker(OwnPrecisionModule):
 
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
-
-
-def _check_kind(name: str, value: object, kind: type) -> None:
-    """Raise `InputError` unless an argument is None, of a kind, or the name of a file."""
-    if not isinstance(value, kind | str | Path | None):
-        raise InputError(
-            f"{name} must be a {kind.__name__} or the name of its file, got {type(value).__name__}"
-        )
 
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:

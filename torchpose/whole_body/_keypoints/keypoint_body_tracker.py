@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -86,7 +87,7 @@ class KeypointBodyTracker(nn.Module):
 
     Args:
         rig: the cameras. fps: frames per second. body: the person's, whose bone lengths are kept, or None.
-        height: of the person, metres, or None. motion: how bodies move, the shipped one by default.
+        height: of the person, metres, or None. motion: how bodies move, or its name or file.
         keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
         pixel_std: pixels, how far they are apart from that; None is the usual, of both.
         up: "y" or "z", the axis of the world that points up, if it is known.
@@ -103,7 +104,7 @@ class KeypointBodyTracker(nn.Module):
         *,
         body: Body | None = None,
         height: float | None = None,
-        motion: BodyMotion | None = None,
+        motion: BodyMotion | str | Path = "whole-body",
         keypoint_std: float | None = None,
         pixel_std: float | None = None,
         up: str | None = None,
@@ -121,7 +122,7 @@ class KeypointBodyTracker(nn.Module):
         self.reader = KeypointReader(
             rig, keypoint_std, PIXEL_STD if pixel_std is None else pixel_std
         )
-        motion = load_body_motion("whole-body") if motion is None else motion
+        motion = motion if isinstance(motion, BodyMotion) else load_body_motion(motion)
         if body is not None:
             motion = with_body(motion, body)
         elif height is not None:
