@@ -64,28 +64,9 @@ class KeypointReader:
             if value is not None:
                 check_shape(name, value, list(shape))
         points = keypoints.to(self.rig.matrix)
-        trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
-        trust = trust.nan_to_num(0.0)
-        known = torch.isfinite(points).all(-1) & ~is_filled(points)
-        outside = known & ((trust < 0) | (trust > MOST_CONFIDENCE))
-        if bool(outside.any()):
-            raise InputError(
-                "confidence must lie in [0, 1] (0 or NaN is missing), got "
-                f"{self._first_of(trust, outside)}; {CONFIDENCE_ADVICE}"
-            )
-        trust = trust.clamp(0.0, 1.0)
-        there = known & (trust > 0)
-        own = self.pixel_std**2 * torch.ones_like(trust)
-        relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
-        if covariance is not None:
-            own, relative = covariance.to(points), torch.zeros_like(trust)
-            least, most = (std**2 for std in _STDS)
-            wrong = there & ~((own >= least) & (own <= most))
-            if bool(wrong.any()):
-                raise InputError(
-                    f"covariance of keypoints must lie between {least:g} and {most:g} pixels squared, got "
-                    f"{self._first_of(own, wrong)}; a keypoint that tells nothing has the confidence 0"
-                )
+        trust = self._trust(points, confidence)
+        there = trust > 0
+        own, relative = self._noise(trust, covariance)
         inlier = torch.where(there, trust.clamp(*INLIER), 0.0)
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
         table = table.masked_fill(~there[..., None], torch.nan)
@@ -103,6 +84,37 @@ class KeypointReader:
             both.map(lambda value: value.narrow(axis, 0, n_joints)),
             both.map(lambda value: value.narrow(axis, n_joints, n_points - n_joints)),
         )
+
+    def _trust(
+        self, points: Float[Tensor, "*batch C J 2"], confidence: Tensor | None
+    ) -> Float[Tensor, "*batch C J"]:
+        """Return how far keypoints are trusted, from 0, of those that are missing, to 1."""
+        trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
+        known = torch.isfinite(points).all(-1) & ~is_filled(points)
+        trust = trust.nan_to_num(0.0) * known
+        outside = (trust < 0) | (trust > MOST_CONFIDENCE)
+        if bool(outside.any()):
+            raise InputError(
+                "confidence must lie in [0, 1] (0 or NaN is missing), got "
+                f"{self._first_of(trust, outside)}; {CONFIDENCE_ADVICE}"
+            )
+        return trust.clamp(0.0, 1.0)
+
+    def _noise(
+        self, trust: Float[Tensor, "*batch C J"], covariance: Tensor | None
+    ) -> tuple[Float[Tensor, "*batch C J"], Float[Tensor, "*batch C J"]]:
+        """Return variances of keypoints, pixels squared, and those that go with the body, metres squared."""
+        if covariance is None:
+            own = self.pixel_std**2 * torch.ones_like(trust)
+            return own, self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
+        own, (least, most) = covariance.to(trust), (std**2 for std in _STDS)
+        wrong = (trust > 0) & ~((own >= least) & (own <= most))
+        if bool(wrong.any()):
+            raise InputError(
+                f"covariance of keypoints must lie between {least:g} and {most:g} pixels squared, got "
+                f"{self._first_of(own, wrong)}; a keypoint that tells nothing has the confidence 0"
+            )
+        return own, torch.zeros_like(trust)
 
     def _first_of(
         self, values: Float[Tensor, "*batch C J"], wrong: Bool[Tensor, "*batch C J"]
