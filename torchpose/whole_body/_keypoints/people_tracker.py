@@ -1,18 +1,19 @@
 """Track several persons through detections of keypoints: whose are whose, who enters, who leaves."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.rows import joined
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, CorrectedBody
 from torchpose.whole_body._keypoints.faulty_cameras import CameraFaults
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.keypoint_tracker import KeypointTracker
-from torchpose.whole_body._keypoints.nested import mapped, taken
+from torchpose.whole_body._keypoints.nested import taken
 from torchpose.whole_body._keypoints.people_association import (
     assign,
     detection_gains,
@@ -40,30 +41,46 @@ _LEAST_INLIERS = 0.5  # share of the keypoints of a start that must be those of 
 _AS_WELL = 0.95  # the same of who begins anew, relative to the share of the body as it was followed
 
 
-class PeopleStream(NamedTuple):
-    """Holds the state of tracking P persons between two frames.
+class TrackedPeople(NamedTuple):
+    """Holds P persons between two frames.
 
     Attributes:
-        bodies: of their filters, None if there is nobody.
-        number: [P], unlike all others before. n_begun: of numbers that were given.
+        bodies: of their filters, None if there is nobody. number: [P], unlike all others before.
+        identity: [P], from 1 on in the order in which they were confirmed, 0 of those who are tentative.
         hits: [P], frames in which cameras agreed. missed: [P], frames in a row in which they did not.
         unseen: [P], frames in a row without keypoints. doubled: [P], frames in a row at another's place.
         away: [P], who was not seen for so long since cameras agreed that somebody else may have come.
-        identity: [P], from 1 on in the order in which they were confirmed, 0 of those who are tentative.
-        n_confirmed: of identities that were given.
-        faults: what is believed of the cameras, of one element; None before somebody was there.
     """
 
     bodies: KeypointStream | None
     number: Tensor
-    n_begun: int
+    identity: Tensor
     hits: Tensor
     missed: Tensor
     unseen: Tensor
     doubled: Tensor
     away: Tensor
-    identity: Tensor
-    n_confirmed: int
+
+    @classmethod
+    def begun(
+        cls, bodies: KeypointStream | None, number: Tensor, identity: Tensor, like: Tensor
+    ) -> Self:
+        """Return persons who begin, with counts of the dtype of a tensor."""
+        zero = like.new_zeros(len(number))
+        return cls(bodies, number, identity, zero, zero, zero, zero, zero > 0)
+
+
+class PeopleStream(NamedTuple):
+    """Holds the state of tracking persons between two frames.
+
+    Attributes:
+        persons: who are there. n_begun, n_confirmed: of numbers and identities that were given.
+        faults: what is believed of the cameras, of one element; None before somebody was there.
+    """
+
+    persons: TrackedPeople
+    n_begun: int = 0
+    n_confirmed: int = 0
     faults: CameraFaults | None = None
 
 
@@ -110,7 +127,7 @@ class PeopleTracker:
         detected, frame = frame, righted(self.tracker, frame, stream.faults)
         there = frame.there.any(-1).mT  # [C, D]
         found, free, predicted = None, there, None
-        if stream.bodies is not None:
+        if stream.persons.bodies is not None:
             stream, found, free, predicted = self._followed(stream, frame, there)
         stream, found = self._with_new(stream, found, frame, free, predicted)
         if found is None:
@@ -119,15 +136,15 @@ class PeopleTracker:
         if found is None:
             return stream, None
         stream = self._counted(stream, found)
-        return self._without_gone(stream), found._replace(identity=stream.identity)
+        return self._without_gone(stream), found._replace(identity=stream.persons.identity)
 
     def _watched(
         self, stream: PeopleStream, found: PeopleFrame, detected: KeypointFrame
     ) -> tuple[PeopleStream, PeopleFrame | None]:
         """Return the stream and the frame, with keypoints as they were detected, by cameras as they are."""
-        assert stream.bodies is not None
+        assert stream.persons.bodies is not None
         keypoints = taken_detections(detected, found.detection)
-        tracked = stream.bodies, found.poses, found.corrected
+        tracked = stream.persons.bodies, found.poses, found.corrected
         strays = strays_of(detected, found.detection)
         faults, due = watched_cameras(self.tracker, stream.faults, tracked, keypoints, strays)
         if due:
@@ -147,23 +164,23 @@ class PeopleTracker:
         self, stream: PeopleStream, frame: KeypointFrame, there: Bool[Tensor, "C D"]
     ) -> tuple[PeopleStream, PeopleFrame, Bool[Tensor, "C D"], BodyGaussian]:
         """Return persons one frame later, detections that begin others, and where persons were expected."""
-        bodies = stream.bodies
+        people, bodies = stream.persons, stream.persons.bodies
         assert bodies is not None
         predicted = self.tracker.filter.predict(bodies.state, bodies.coasting)
         gains = detection_gains(self.tracker.filter, predicted, frame)
-        chosen = self._chosen(gains, predicted, frame, there, stream.away)
+        chosen = self._chosen(gains, predicted, frame, there, people.away)
         keypoints = taken_detections(frame, chosen)
         after, poses, corrected = self.tracker.advance(bodies, keypoints, predicted, watch=False)
-        found = PeopleFrame(stream.number, stream.identity, chosen, keypoints, poses, corrected)
-        weak = self._weak(stream)
+        found = PeopleFrame(people.number, people.identity, chosen, keypoints, poses, corrected)
+        weak = self._weak(people)
         explained = (gains > 0.0).masked_fill(weak[:, None, None], False).any(0)
         owned = owned_detections(chosen[~weak], there.shape[1])
         free = there & ~explained & ~owned
-        return stream._replace(bodies=after), found, free, predicted
+        return stream._replace(persons=people._replace(bodies=after)), found, free, predicted
 
-    def _weak(self, stream: PeopleStream) -> Bool[Tensor, " P"]:
+    def _weak(self, people: TrackedPeople) -> Bool[Tensor, " P"]:
         """Return who may give their detections up: on whom no cameras have agreed for a while."""
-        return stream.missed > _ALONE_TIME * self.tracker.filter.fps
+        return people.missed > _ALONE_TIME * self.tracker.filter.fps
 
     def _chosen(
         self,
@@ -205,19 +222,20 @@ class PeopleTracker:
         anew with them and stays the same person, if one body explains all of them as well. Two such persons
         whose keypoints seem to agree stay where they are.
         """
+        people = stream.persons
         groups = group_detections(self.tracker.filter.maps, frame, free)
-        owner = _owners(groups, found, self._weak(stream) & ~stream.away)
-        if predicted is not None and len(groups) and bool(stream.away.any()):
+        owner = _owners(groups, found, self._weak(people) & ~people.away)
+        if predicted is not None and len(groups) and bool(people.away.any()):
             keypoints = taken_detections(frame, groups)
-            owner = self._with_returned(owner, stream, found, groups, keypoints, predicted)
+            owner = self._with_returned(owner, people, found, groups, keypoints, predicted)
         again = (owner & (owner.cumsum(1) > 1)).any(0)  # a second group of the same person
-        chosen = (owner.sum(0) <= 1) & ~again & self._has_room(~owner.any(0), len(stream.number))
+        chosen = (owner.sum(0) <= 1) & ~again & self._has_room(~owner.any(0), len(people.number))
         return self._begun(stream, found, frame, groups[chosen], owner[:, chosen])
 
     def _with_returned(
         self,
         owner: Bool[Tensor, "P G"],
-        stream: PeopleStream,
+        people: TrackedPeople,
         found: PeopleFrame | None,
         groups: Int[Tensor, "G C"],
         keypoints: KeypointFrame,
@@ -229,10 +247,10 @@ class PeopleTracker:
         if it has seen them since, else of as many as must agree.
         """
         if self.n_cameras > 1:
-            expected = returned(self.tracker.filter, predicted, stream.away, owner, keypoints)
+            expected = returned(self.tracker.filter, predicted, people.away, owner, keypoints)
             owner = owner | expected
-        shared = _owners(groups, found, stream.away & (stream.unseen == 0))
-        shared |= _owners(groups, found, stream.away, self.agreeing)
+        shared = _owners(groups, found, people.away & (people.unseen == 0))
+        shared |= _owners(groups, found, people.away, self.agreeing)
         return owner | (shared & ~owner.any(0) & ~owner.any(1, keepdim=True))
 
     def _begun_anew(
@@ -244,12 +262,12 @@ class PeopleTracker:
         """
         frame = righted(self.tracker, detected, stream.faults)
         groups = group_detections(self.tracker.filter.maps, frame, frame.there.any(-1).mT)
-        shares = _owners(groups, found, torch.ones_like(stream.number, dtype=torch.bool))
+        shares = _owners(groups, found, torch.ones_like(found.number, dtype=torch.bool))
         owner = shares & (shares.cumsum(0) == 1)
         owner = owner & (owner.cumsum(1) == 1)
         rows = (owner.any(1) | ~shares.any(1)).nonzero().squeeze(-1)
         rest = taken(found, rows) if len(rows) else None
-        stream, owner = self._kept(stream, rows), owner[rows]
+        stream, owner = stream._replace(persons=_kept(stream.persons, rows)), owner[rows]
         chosen = self._has_room(~owner.any(0), len(rows))
         return self._begun(stream, rest, frame, groups[chosen], owner[:, chosen])
 
@@ -267,26 +285,20 @@ class PeopleTracker:
         keypoints = taken_detections(frame, groups)
         bodies, poses, corrected = self.tracker.advance(None, keypoints, watch=False)
         sure = _explained(poses, keypoints) >= _needed(owner, found)
-        former, identity = _owned_by(stream.number, owner, -1), _owned_by(stream.identity, owner, 0)
+        people = stream.persons
+        former, identity = _owned_by(people.number, owner, -1), _owned_by(people.identity, owner, 0)
         number = torch.arange(len(groups), device=groups.device) + stream.n_begun
         number = torch.where(former >= 0, former, number)
         begun = PeopleFrame(number, identity, groups, keypoints, poses, corrected)
-        zero = poses.log_evidence.new_zeros(len(groups))
-        n_begun = stream.n_begun + len(groups)
-        beginners = PeopleStream(
-            bodies, number, n_begun, hits=zero, missed=zero, unseen=zero, doubled=zero, away=zero > 0,
-            identity=identity, n_confirmed=stream.n_confirmed, faults=stream.faults,
-        )  # fmt: skip
+        beginners = TrackedPeople.begun(bodies, number, identity, poses.log_evidence)
         rows, keep = (flags.nonzero().squeeze(-1) for flags in (sure, ~owner[:, sure].any(-1)))
-        stream = self._kept(stream, keep)._replace(n_begun=n_begun)
-        if not len(rows):
-            return stream, found
-        beginners, begun = self._kept(beginners, rows), taken(begun, rows)
-        if stream.bodies is None or found is None:
-            return beginners, begun
-        faults = stream.faults
-        joined = _joined(stream._replace(faults=None), beginners._replace(faults=None))
-        return joined._replace(faults=faults), _joined(taken(found, keep), begun)
+        people = _kept(people, keep)
+        if len(rows):
+            beginners, begun = taken((beginners, begun), rows)
+            there = people.bodies is not None and found is not None
+            people = joined([people, beginners]) if there else beginners
+            found = joined([taken(found, keep), begun]) if there else begun
+        return stream._replace(persons=people, n_begun=stream.n_begun + len(groups)), found
 
     def _has_room(self, new: Bool[Tensor, " G"], count: int) -> Bool[Tensor, " G"]:
         """Return which groups may begin: persons who are there already, and others up to the most."""
@@ -298,52 +310,44 @@ class PeopleTracker:
 
     def _counted(self, stream: PeopleStream, found: PeopleFrame) -> PeopleStream:
         """Return the stream with the frame counted."""
-        fps = self.tracker.filter.fps
+        fps, people = self.tracker.filter.fps, stream.persons
         n_seen = (found.detection >= 0).sum(-1)
         agreed = n_seen >= self.agreeing
-        hits = stream.hits + agreed.to(stream.hits)
+        hits = people.hits + agreed.to(people.hits)
         doubled = _doubled(found.poses.joints)
         confirmed = hits >= max(_CONFIRM_FRAMES, _CONFIRM_TIME * fps)
-        new = (stream.identity == 0) & ~doubled & confirmed
-        identity = torch.where(new, stream.n_confirmed + new.cumsum(0), stream.identity)
-        unseen = torch.where(n_seen > 0, 0.0, stream.unseen + 1.0)
-        return stream._replace(
+        new = (people.identity == 0) & ~doubled & confirmed
+        unseen = torch.where(n_seen > 0, 0.0, people.unseen + 1.0)
+        people = people._replace(
+            identity=torch.where(new, stream.n_confirmed + new.cumsum(0), people.identity),
             hits=hits,
-            missed=torch.where(agreed, 0.0, stream.missed + 1.0),
+            missed=torch.where(agreed, 0.0, people.missed + 1.0),
             unseen=unseen,
-            away=~agreed & (stream.away | (unseen > _ALONE_TIME * fps)),
-            doubled=torch.where(doubled, stream.doubled + 1.0, 0.0),
-            identity=identity,
-            n_confirmed=stream.n_confirmed + int(new.sum()),
+            doubled=torch.where(doubled, people.doubled + 1.0, 0.0),
+            away=~agreed & (people.away | (unseen > _ALONE_TIME * fps)),
         )
+        return stream._replace(persons=people, n_confirmed=stream.n_confirmed + int(new.sum()))
 
     def _without_gone(self, stream: PeopleStream) -> PeopleStream:
         """Return the stream without those who left, were never confirmed, or are somebody else."""
-        fps = self.tracker.filter.fps
-        gone = stream.unseen > _GONE_TIME * fps
-        gone |= (stream.identity == 0) & (stream.missed > _TENTATIVE_TIME * fps)
-        gone |= stream.doubled > _SAME_TIME * fps
-        return self._kept(stream, (~gone).nonzero().squeeze(-1))
-
-    def _kept(self, stream: PeopleStream, rows: Int[Tensor, " n"]) -> PeopleStream:
-        """Return the stream with some persons alone."""
-        if stream.bodies is None or len(rows) == len(stream.number):
-            return stream
-        rest = taken(stream.bodies, rows)
-        other: dict[str, Any] = {
-            name: value[rows]
-            for name, value in stream._asdict().items()
-            if isinstance(value, Tensor)
-        }
-        return stream._replace(bodies=rest if len(rows) else None, **other)
+        fps, people = self.tracker.filter.fps, stream.persons
+        gone = people.unseen > _GONE_TIME * fps
+        gone |= (people.identity == 0) & (people.missed > _TENTATIVE_TIME * fps)
+        gone |= people.doubled > _SAME_TIME * fps
+        return stream._replace(persons=_kept(people, (~gone).nonzero().squeeze(-1)))
 
 
 def _nobody(frame: KeypointFrame) -> PeopleStream:
-    none = frame.inlier.new_zeros(0)
-    return PeopleStream(
-        None, none.long(), 0, hits=none, missed=none, unseen=none, doubled=none, away=none > 0,
-        identity=none.long(), n_confirmed=0,
-    )  # fmt: skip
+    none = frame.inlier.new_zeros(0, dtype=torch.long)
+    return PeopleStream(TrackedPeople.begun(None, none, none, frame.inlier))
+
+
+def _kept(people: TrackedPeople, rows: Int[Tensor, " n"]) -> TrackedPeople:
+    """Return some of the persons."""
+    if len(rows) == len(people.number):
+        return people
+    rest: TrackedPeople = taken(people, rows)
+    return rest if len(rows) else rest._replace(bodies=None)
 
 
 def _owners(
@@ -386,8 +390,3 @@ def _doubled(joints: Float[Tensor, "P J 3"]) -> Bool[Tensor, " P"]:
     apart = (joints[:, None] - joints).norm(dim=-1).mean(-1)
     earlier = torch.ones_like(apart).tril(-1) > 0.0
     return (torch.where(earlier, apart, math.inf) < _SAME).any(-1)
-
-
-def _joined(first: Any, second: Any) -> Any:
-    """Return the persons of two named tuples of tensors in one; numbers are the second's."""
-    return mapped(lambda a, b: torch.cat([a, b]) if isinstance(a, Tensor) else b, first, second)
