@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_finite, check_height, check_shape
+from torchpose._core.checks import check_choice, check_finite, check_height, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose.body._limbs import (
     Limbs,
@@ -111,8 +111,7 @@ class Body(nn.Module):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        if frame not in FRAMES:
-            raise InputError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+        check_choice("frame", frame, FRAMES)
         self.skeleton, self.frame, self.dim = skeleton, frame, skeleton.dim
         device = bone_lengths.device
         lengths = checked_lengths(skeleton, bone_lengths.double())

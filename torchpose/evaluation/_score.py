@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_count
+from torchpose._core.checks import check_choice, check_count
 from torchpose._core.files import check_output_folder
 from torchpose._core.wording import counted
 from torchpose.errors import InputError, OverlapError
@@ -131,10 +131,9 @@ def run(
 
 
 def _check(method: str | None, joints: str, noise_std: float, every: int) -> None:
-    if method is not None and method not in METHODS:
-        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    if joints not in _SEEN:
-        raise InputError(f"joints must be one of {', '.join(_SEEN)}, got {joints!r}")
+    if method is not None:
+        check_choice("method", method, METHODS)
+    check_choice("joints", joints, _SEEN)
     if not 0 < noise_std < float("inf"):
         raise InputError(f"noise_std must be positive, got {noise_std:g}")
     check_count("every", every)

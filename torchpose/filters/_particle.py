@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_count
+from torchpose._core.checks import check_choice, check_count
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived, register_given, wide_or_parameter
 from torchpose._core.value_checks import values_visible
@@ -392,14 +392,9 @@ def _check_options(
     start: str,
     transition: str,
 ) -> None:
-    chosen = {
-        "proposal": (proposal, PROPOSALS),
-        "resampling": (resampling, tuple(RESAMPLING)),
-        "start": (start, _STARTS),
-    }
-    for name, (value, known) in chosen.items():
-        if value not in known:
-            raise InputError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    check_choice("proposal", proposal, PROPOSALS)
+    check_choice("resampling", resampling, RESAMPLING)
+    check_choice("start", start, _STARTS)
     if isinstance(n_particles, bool) or not isinstance(n_particles, int) or n_particles < 1:
         raise InputError(f"n_particles must be a whole number of at least 1, got {n_particles!r}")
     if not 0 <= threshold <= 1:

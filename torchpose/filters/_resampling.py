@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_positive, check_shape
+from torchpose._core.checks import check_choice, check_count, check_positive, check_shape
 from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators, uniform
 
@@ -135,8 +135,8 @@ def resample(
     check_shape("log_weights", log_weights, ["B", "N"])
     if log_weights.numel() == 0:
         raise InputError(f"log_weights must hold particles, got {list(log_weights.shape)}")
-    if n_samples is not None and n_samples < 1:
-        raise InputError(f"n_samples must be at least 1, got {n_samples}")
+    if n_samples is not None:
+        check_count("n_samples", n_samples)
     return RESAMPLING[method](log_weights, generator, n_samples)
 
 

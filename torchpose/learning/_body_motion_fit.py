@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_positive
 from torchpose.body._articulation import Articulation, mirror_of
 from torchpose.errors import InputError
 from torchpose.learning._motion_dynamics import (
@@ -68,9 +69,7 @@ class BodyMotionRecipe:
         if self.n_samples < self.n_components:
             raise InputError(f"n_samples must be at least n_components, got {self.n_samples}")
         for name in ("covariance_floor", "acceleration_scale", "least_shift", "pull_time"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise InputError(f"{name} must be positive and finite, got {value:g}")
+            check_positive(name, getattr(self, name))
 
 
 def fit_body_motion(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import InputError
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.priors._manifold.prediction import KernelParameters, covariance, rbf
@@ -330,8 +330,7 @@ def _check(
     poses: Tensor, latent_dim: int, gamma_x: float, optimiser: str, rate: float | None
 ) -> None:
     check_shape("poses", poses, ("T", "Q"))
-    if optimiser not in OPTIMISERS:
-        raise InputError(f"optimiser must be one of {', '.join(OPTIMISERS)}, got {optimiser!r}")
+    check_choice("optimiser", optimiser, OPTIMISERS)
     if not 1 <= latent_dim <= poses.shape[1]:
         raise InputError(
             f"latent_dim must be from 1 to the number of columns, {poses.shape[1]}, got {latent_dim}"

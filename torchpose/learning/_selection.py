@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose.errors import InputError
 from torchpose.learning._blocks import ALONE, Share, usable_samples
 from torchpose.learning._samplers import SampleSource
@@ -201,8 +202,7 @@ def _check_request(numbers: list[int], groups: list[SampleSource], rule: str) ->
         raise InputError("candidates must hold at least one number of components, got none")
     if not groups:
         raise InputError("held_out must hold at least one source, got none")
-    if rule not in RULES:
-        raise InputError(f"rule must be one of {', '.join(RULES)}, got {rule!r}")
+    check_choice("rule", rule, RULES)
     if rule != "best" and sum(source.n_blocks for source in groups) < 2:
         raise InputError(
             f"the rule {rule} needs held-out states of at least two persons or blocks, got one; "

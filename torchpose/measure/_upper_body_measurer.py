@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_rgb
+from torchpose._core.checks import check_choice, check_count, check_rgb
 from torchpose._core.images import Image
 from torchpose._core.module_state import CpuModule, as_one_run
 from torchpose.errors import InputError
@@ -164,10 +164,9 @@ class UpperBodyMeasurer(CpuModule):
         head_neck: HeadNeck | None = None,
     ) -> None:
         super().__init__()
-        if hands not in HAND_TRACKERS:
-            raise InputError(f"hands must be one of {', '.join(HAND_TRACKERS)}, got {hands!r}")
-        if max_persons is not None and max_persons < 1:
-            raise InputError(f"max_persons must be at least 1, got {max_persons}")
+        check_choice("hands", hands, HAND_TRACKERS)
+        if max_persons is not None:
+            check_count("max_persons", max_persons)
         if not fps > 0:
             raise InputError(f"fps must be positive, got {fps}")
         self.fps, self.max_persons = float(fps), max_persons

@@ -403,8 +403,8 @@ def _check_fit(
 ) -> None:
     check_shape("x", x, ("N", "D"))
     check_finite("x", x, hint="drop frames with missing joints before the fit")
-    for name, value in (("n_components", n_components), ("n_init", n_init)):
-        check_count(name, value)
+    check_count("n_components", n_components)
+    check_count("n_init", n_init)
     if len(x) < n_components:
         raise InputError(
             f"a fit needs at least as many points as components, got {len(x)} points for "

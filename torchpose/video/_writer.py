@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from torchpose._core.checks import check_choice
 from torchpose._core.files import atomic_path
 from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
@@ -101,8 +102,7 @@ class VideoWriter:
             )
         if not 0 <= crf <= 51:
             raise InputError(f"crf must be from 0 to 51, got {crf}")
-        if preset not in _PRESETS:
-            raise InputError(f"preset must be one of {', '.join(_PRESETS)}, got {preset!r}")
+        check_choice("preset", preset, _PRESETS)
 
     def _start(self, temporary: Path, encoder: str, crf: int, preset: str) -> None:
         import av

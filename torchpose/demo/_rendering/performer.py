@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose._core.files import write_npz
 from torchpose._core.images import Image
 from torchpose.camera._pinhole import PinholeCamera
@@ -186,8 +187,7 @@ def choose_looks(look: str | Look | Sequence[str | Look], n: int) -> list[Look]:
     chosen = []
     for i, one in enumerate(given):
         if isinstance(one, str):
-            if one not in LOOKS:
-                raise InputError(f"look must be one of {', '.join(LOOKS)}, got {one!r}")
+            check_choice("look", one, LOOKS)
             one = LOOKS[one]
             if i % 2:
                 one = one._replace(mirrored=True, tone=(0.90, 0.86, 0.84))

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import FileFormatError, InputError
+from torchpose._core.checks import check_choice
+from torchpose.errors import FileFormatError
 from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 
 Axes = Literal["camera", "kinect", "y-up", "z-up"]
@@ -62,8 +63,7 @@ def axes_rotation(
     Raises:
         InputError: other axes.
     """
-    if axes not in _TO_CAMERA:
-        raise InputError(f"axes must be one of {', '.join(AXES)}, got {axes!r}")
+    check_choice("axes", axes, AXES)
     base = torch.tensor(_TO_CAMERA[axes], dtype=joints.dtype)
     skeleton = identify_skeleton(names)
     if axes in ("camera", "kinect") or (skeleton is not None and not skeleton.turned):

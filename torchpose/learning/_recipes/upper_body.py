@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_count
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._viewpoints import ViewRange
 from torchpose.errors import InputError, PriorError
@@ -124,8 +125,7 @@ class UpperBodyRecipe:
         check_rotation_order(self.rotation_order)
         PinholeCamera(*self.camera_matrix)  # refuses what is no camera
         for name in ("n_components", "n_samples", "pose_steps", "window_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+            check_count(name, getattr(self, name))
         for name in ("window_components", "window_samples", "calibration_folds", "drawn_pieces"):
             value = getattr(self, name)
             if value is not None and value < 0:

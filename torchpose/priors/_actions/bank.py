@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_count, check_finite, check_shape
 from torchpose._core.estimates import check_number_range
 from torchpose._core.module_state import NoHalfModule
 from torchpose._core.reading import reading
@@ -443,5 +443,5 @@ def _check_settings(info: BankInfo) -> None:
     for name in ("spread", "background"):
         if not 0 < getattr(info, name) < math.inf:
             raise InputError(f"{name} must be positive, got {getattr(info, name):g}")
-    if info.gate_dimensions is not None and info.gate_dimensions < 1:
-        raise InputError(f"gate_dimensions must be at least 1, got {info.gate_dimensions}")
+    if info.gate_dimensions is not None:
+        check_count("gate_dimensions", info.gate_dimensions)

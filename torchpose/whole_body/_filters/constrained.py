@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_choice
+from torchpose._core.checks import check_choice, check_positive
 from torchpose._core.wording import counted
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
@@ -125,8 +125,8 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
                 "a bank compares motions that are normalised under every action, as redrawing does; "
                 "expected weights='published', got 'normalised'"
             )
-        if fps is not None and not 0 < fps < float("inf"):
-            raise InputError(f"fps must be positive and finite, got {fps}")
+        if fps is not None:
+            check_positive("fps", fps)
         if isinstance(action, ActionBank):
             action.frame_rate(fps)  # there is one
         self.velocity_rate, self.max_redraws, self.weights = velocity_rate, max_redraws, weights
