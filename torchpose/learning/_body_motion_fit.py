@@ -73,8 +73,7 @@ class BodyMotionRecipe:
 
 
 def fit_body_motion(
-    sequences: Sequence[MotionSequence],
-    recipe: BodyMotionRecipe | None = None,
+    sequences: Sequence[MotionSequence], recipe: BodyMotionRecipe | None = None
 ) -> BodyMotion:
     """Fit how bodies move, their poses and proportions to recorded motion.
 

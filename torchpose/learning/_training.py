@@ -156,10 +156,7 @@ def collect_poses(
 
 
 def _with_neck(
-    wanted: str,
-    joints: Sequence[Tensor],
-    kinds: Sequence[str | None],
-    beside: Sequence[Any],
+    wanted: str, joints: Sequence[Tensor], kinds: Sequence[str | None], beside: Sequence[Any]
 ) -> tuple[list[Tensor], dict[str, Any]]:
     """Return joints with necks of one kind, and facts about those that were converted.
 

@@ -300,10 +300,7 @@ class Motion(nn.Module):
         return state._replace(last=last, median=median, grey=greys, flow=flows)
 
     def step(
-        self,
-        state: MotionState,
-        small: Float[Tensor, "N 3 h w"],
-        grey: UInt8[Tensor, "N H W"],
+        self, state: MotionState, small: Float[Tensor, "N 3 h w"], grey: UInt8[Tensor, "N H W"]
     ) -> tuple[
         MotionState, Float[Tensor, "N h w"], Float[Tensor, "N h w"], Float[Tensor, "N r c 2"]
     ]:

@@ -4,13 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.measure._body_window import (
-    CELL,
-    CELLS,
-    cell_axes,
-    cells_to_pixels,
-    pixels_to_cells,
-)
+from torchpose.measure._body_window import CELL, CELLS, cell_axes, cells_to_pixels, pixels_to_cells
 from torchpose.measure._grid_filter import read_out
 from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
 from torchpose.measure._hand_network import HandPlaces

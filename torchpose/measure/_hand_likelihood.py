@@ -99,9 +99,7 @@ class HandLikelihood(nn.Module):
         return self.hand_rows @ maps @ self.hand_columns.T
 
     def forward(
-        self,
-        means: Float[Tensor, "N 4 r c"],
-        places: Float[Tensor, "N P 2 r c 2"],
+        self, means: Float[Tensor, "N 4 r c"], places: Float[Tensor, "N P 2 r c 2"]
     ) -> Float[Tensor, "N 2 r c"]:
         """Return the log-likelihood of the left and the right hand, up to a constant.
 
@@ -322,10 +320,7 @@ def no_hands(faces: Float[Tensor, "0 3"]) -> HandMeasurements:
 
 
 def check_frame(
-    frame: Image,
-    faces: Float[Tensor, "N 3"],
-    identity: Int[Tensor, " N"],
-    foreground: Image | None,
+    frame: Image, faces: Float[Tensor, "N 3"], identity: Int[Tensor, " N"], foreground: Image | None
 ) -> None:
     """Raise unless these are a frame, faces with a size, their numbers, and a mask of the frame.
 

@@ -18,13 +18,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.network_file import FittedNetwork
 from torchpose._core.tensor_file import FileKind
-from torchpose.measure._body_window import (
-    CELLS,
-    EVIDENCE,
-    cell_centres,
-    halve,
-    part_of_window,
-)
+from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres, halve, part_of_window
 from torchpose.measure._hand_layers import Layer, UpwardLayer, for_inference
 
 COARSE = (CELLS[0] // 2, CELLS[1] // 2)
@@ -102,10 +96,7 @@ class HandNetwork(FittedNetwork):
         self.high = nn.Sequential(Layer(fine + side + _PLACES, high), Layer(high, high))
         self.middle = nn.Sequential(Layer(high, middle, 3, 2), Layer(middle, middle))
         self.low = nn.Sequential(
-            Layer(middle, low, 3, 2),
-            nn.Dropout2d(0.1),
-            Layer(low, low),
-            Layer(low, low, 3, 1, 2),
+            Layer(middle, low, 3, 2), nn.Dropout2d(0.1), Layer(low, low), Layer(low, low, 3, 1, 2)
         )
         self.to_middle = UpwardLayer(low, middle, middle)
         self.to_high = UpwardLayer(middle, high, high)

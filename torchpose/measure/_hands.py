@@ -22,13 +22,7 @@ from torchpose.measure._body_window import (
     move_maps,
     pixels_to_cells,
 )
-from torchpose.measure._grid_filter import (
-    exclude,
-    gaussian_bump,
-    predict,
-    read_out,
-    without_jumps,
-)
+from torchpose.measure._grid_filter import exclude, gaussian_bump, predict, read_out, without_jumps
 from torchpose.measure._hand_elbows import expected_elbows, find_elbows, in_frame
 from torchpose.measure._hand_likelihood import (
     HandLikelihood,

@@ -201,12 +201,7 @@ class PersonRegister(nn.Module):
         return persons._replace(colours=known, last_seen=last_seen), owner
 
     def _admit(
-        self,
-        persons: Persons,
-        colours: Tensor,
-        identity: Tensor,
-        followed: Tensor,
-        frame: int,
+        self, persons: Persons, colours: Tensor, identity: Tensor, followed: Tensor, frame: int
     ) -> tuple[Persons, int]:
         """Return the next state and the number of a newcomer, who is none of those `followed` already."""
         alike = (persons.colours * colours).sqrt().sum(1)

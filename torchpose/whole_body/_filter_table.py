@@ -266,12 +266,7 @@ def check_options(method: str, options: Iterable[str]) -> None:
 
 
 def make_filter(
-    method: str,
-    body: Body,
-    learnt: Any,
-    fps: float,
-    n_particles: int,
-    options: Mapping[str, Any],
+    method: str, body: Body, learnt: Any, fps: float, n_particles: int, options: Mapping[str, Any]
 ) -> SilhouetteParticleFilter:
     """Return the filter of a method, with its usual noise and sharpness for tracking from images.
 

@@ -158,10 +158,7 @@ class ParticleFollower:
         return found
 
     def first_state(
-        self,
-        frames: Sequence[Observed],
-        generator: torch.Generator | None,
-        facing: Tensor | None,
+        self, frames: Sequence[Observed], generator: torch.Generator | None, facing: Tensor | None
     ) -> Float[Tensor, " D"]:
         """Return the pose of the filter's body in the first of some frames: from keypoints if there are any.
 

@@ -11,11 +11,7 @@ from torch import Tensor
 from torchpose._core.checks import check_choice, check_finite, check_shape
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
-from torchpose.filters._recursive_filter import (
-    Generators,
-    standard_normal,
-    uniform,
-)
+from torchpose.filters._recursive_filter import Generators, standard_normal, uniform
 from torchpose.math._rotations import (
     compose,
     minimal_rotation,

@@ -17,11 +17,7 @@ from torchpose.whole_body._keypoints.camera_cause_notes import (
     notes_on_causes,
 )
 from torchpose.whole_body._keypoints.camera_causes import FOCAL, LENS, Causes, explain
-from torchpose.whole_body._keypoints.camera_notes import (
-    CameraDoubts,
-    notes_on_cameras,
-    sure_delays,
-)
+from torchpose.whole_body._keypoints.camera_notes import CameraDoubts, notes_on_cameras, sure_delays
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 

@@ -36,11 +36,7 @@ from torchpose.whole_body._keypoints.faulty_cameras import (
     without_still,
 )
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker
-from torchpose.whole_body._keypoints.keypoint_likelihood import (
-    KeypointFrame,
-    RigMaps,
-    exchange_of,
-)
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, exchange_of
 from torchpose.whole_body._keypoints.keypoint_notes import (
     notes_on_a_rolled_camera,
     notes_on_cameras_now,

@@ -4,10 +4,7 @@ import pytest
 import torch
 
 from torchpose.whole_body import bidirectional
-from torchpose.whole_body._silhouettes.likelihood import (
-    LIKELIHOODS,
-    intersection_over_union,
-)
+from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS, intersection_over_union
 from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
 

@@ -67,9 +67,7 @@ def person_bones(recordings: Sequence[Recording]) -> dict[tuple[str, str | None]
 
 
 def find_wrong_joints(
-    joints: Float[Tensor, "T 8 3"],
-    usual: PersonBones,
-    ratios: tuple[float, ...] = BONE_RATIOS,
+    joints: Float[Tensor, "T 8 3"], usual: PersonBones, ratios: tuple[float, ...] = BONE_RATIOS
 ) -> WrongJoints:
     """Find joints at the ends of bones of a wrong length l: |log l - log L| > max(log r, 6 s).
 

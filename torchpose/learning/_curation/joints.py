@@ -78,9 +78,7 @@ _AWAY = 0.5  # of the distance of a jump: how far from its surroundings a joint 
 
 
 def find_jumps(
-    joints: Float[Tensor, "T J 3"],
-    fps: float,
-    speeds: tuple[float, ...] = JUMP_SPEEDS,
+    joints: Float[Tensor, "T J 3"], fps: float, speeds: tuple[float, ...] = JUMP_SPEEDS
 ) -> Bool[Tensor, "T J"]:
     """Find frames in which a joint is elsewhere than in the frames just before and after.
 

@@ -146,10 +146,7 @@ def count_positions(
 
 
 def part_log_likelihood(
-    counts: PartCounts,
-    *,
-    normalisation: str = "published",
-    cameras: str = "product",
+    counts: PartCounts, *, normalisation: str = "published", cameras: str = "product"
 ) -> Float[Tensor, "*batch V S"]:
     """Return log p(O_i | sigma_s), of all cameras together.
 

@@ -338,10 +338,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
     # --- pieces that `move` uses
 
     def diffuse(
-        self,
-        particles: Float[Tensor, "B N D"],
-        std: Float[Tensor, "*B D"],
-        generator: Generators,
+        self, particles: Float[Tensor, "B N D"], std: Float[Tensor, "*B D"], generator: Generators
     ) -> Float[Tensor, "B N D"]:
         """Return x + N(0, diag(std^2)) (MR 29), within the joint limits; orientations are composed.
 

@@ -57,10 +57,7 @@ def are_lost(lost: Float[Tensor, " B"], fps: float) -> Bool[Tensor, " B"]:
 
 
 def frames_lost(
-    lost: Float[Tensor, " B"],
-    begun: Bool[Tensor, " B"],
-    frame: KeypointFrame,
-    weighed: Weighed,
+    lost: Float[Tensor, " B"], begun: Bool[Tensor, " B"], frame: KeypointFrame, weighed: Weighed
 ) -> Float[Tensor, " B"]:
     """Return for how many frames in a row keypoints have been of something else, or of the other side.
 

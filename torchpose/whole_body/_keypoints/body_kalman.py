@@ -60,12 +60,7 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import (
     with_sides_exchanged,
 )
 from torchpose.whole_body._keypoints.nested import replaced, taken
-from torchpose.whole_body._keypoints.upright import (
-    Expected,
-    Upright,
-    level_cameras_up,
-    upright_of,
-)
+from torchpose.whole_body._keypoints.upright import Expected, Upright, level_cameras_up, upright_of
 
 FEW_INLIERS = 0.7
 """Share of a camera's keypoints below which its calibration may be wrong, and its noise wider."""
@@ -174,11 +169,7 @@ class BodyKalmanFilter(nn.Module):
     """
 
     def __init__(
-        self,
-        motion: BodyMotion,
-        rig: CameraRig,
-        fps: float,
-        up: str | None = None,
+        self, motion: BodyMotion, rig: CameraRig, fps: float, up: str | None = None
     ) -> None:
         super().__init__()
         self.motion, self.fps, self.up = motion, fps, up

@@ -25,11 +25,7 @@ from torchpose.math._gaussian import symmetrise
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.whole_body._keypoints.joint_elimination import eliminated
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate_without
-from torchpose.whole_body._keypoints.keypoint_likelihood import (
-    LEAST_DEPTH,
-    KeypointFrame,
-    RigMaps,
-)
+from torchpose.whole_body._keypoints.keypoint_likelihood import LEAST_DEPTH, KeypointFrame, RigMaps
 
 N_CAUSES = 8
 TURN, FOCAL, LENS = 3, 6, 7

@@ -88,9 +88,7 @@ def _in_camera(track: BodyTrack, rig: CameraRig) -> Float[Tensor, "T 15 3"]:
     return track.joints3d[there] @ R.mT + t
 
 
-def _standing(
-    joints: Float[Tensor, "T 15 3"],
-) -> tuple[Bool[Tensor, " T"], Float[Tensor, "T 3"]]:
+def _standing(joints: Float[Tensor, "T 15 3"]) -> tuple[Bool[Tensor, " T"], Float[Tensor, "T 3"]]:
     """Return in which frames somebody stands, and the direction that is up by trunk and legs."""
     thighs = normalize(joints[:, _HIPS] - joints[:, _KNEES], dim=-1)
     shanks = normalize(joints[:, _KNEES] - joints[:, _ANKLES], dim=-1)

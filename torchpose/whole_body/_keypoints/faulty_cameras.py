@@ -15,11 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.whole_body._keypoints.begin_anew import LEAST_JOINTS, sees_enough
-from torchpose.whole_body._keypoints.body_kalman import (
-    FEW_INLIERS,
-    BodyKalmanFilter,
-    CorrectedBody,
-)
+from torchpose.whole_body._keypoints.body_kalman import FEW_INLIERS, BodyKalmanFilter, CorrectedBody
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Beliefs,
     KeypointFrame,
@@ -92,10 +88,7 @@ def corrected(frame: KeypointFrame, faults: CameraFaults, maps: RigMaps) -> Keyp
 
 
 def _righted(
-    frame: KeypointFrame,
-    turn: Float[Tensor, "B C 3 3"],
-    off: Bool[Tensor, "B C"],
-    maps: RigMaps,
+    frame: KeypointFrame, turn: Float[Tensor, "B C 3 3"], off: Bool[Tensor, "B C"], maps: RigMaps
 ) -> KeypointFrame:
     """Return keypoints turned back, without those of cameras that are off."""
     frame = turned(frame, turn, maps)

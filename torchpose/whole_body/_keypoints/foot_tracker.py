@@ -51,11 +51,7 @@ def _as_bodies_saw(frame: KeypointFrame, poses: KeypointPoses, maps: RigMaps) ->
 
 
 def track_feet(
-    filter: FootFilter,
-    maps: RigMaps,
-    poses: KeypointPoses,
-    frames: KeypointFrame,
-    smoothing: bool,
+    filter: FootFilter, maps: RigMaps, poses: KeypointPoses, frames: KeypointFrame, smoothing: bool
 ) -> FootPoses:
     """Return the feet of whole sequences.
 

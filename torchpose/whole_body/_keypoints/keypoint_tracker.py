@@ -329,11 +329,7 @@ class KeypointTracker(nn.Module):
         return step
 
     def _by_camera(
-        self,
-        camera: int,
-        before: KeypointStream | None,
-        frame: KeypointFrame,
-        step: KeypointStep,
+        self, camera: int, before: KeypointStream | None, frame: KeypointFrame, step: KeypointStep
     ) -> KeypointStep:
         """Return the next frame of persons followed by one camera, in place of what all cameras gave."""
         own = None if before is None else stream_of(before, camera)

@@ -115,11 +115,7 @@ class PoseLifter(nn.Module):
     """
 
     def __init__(
-        self,
-        rig: CameraRig,
-        fps: float,
-        motion: BodyMotion,
-        up: str | None = None,
+        self, rig: CameraRig, fps: float, motion: BodyMotion, up: str | None = None
     ) -> None:
         super().__init__()
         self.network = copy.deepcopy(shipped_lifting_network())

@@ -25,16 +25,9 @@ from torchpose.whole_body._keypoints.keypoint_notes import notes_on_strays
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses
 from torchpose.whole_body._keypoints.keypoint_tracker import to_be_smoothed
 from torchpose.whole_body._keypoints.nested import FrameCollector, one_of, stacked, taken
-from torchpose.whole_body._keypoints.people_association import (
-    pairs_of_detections,
-    taken_detections,
-)
+from torchpose.whole_body._keypoints.people_association import pairs_of_detections, taken_detections
 from torchpose.whole_body._keypoints.people_cameras import strays_of
-from torchpose.whole_body._keypoints.people_tracker import (
-    PeopleFrame,
-    PeopleStream,
-    PeopleTracker,
-)
+from torchpose.whole_body._keypoints.people_tracker import PeopleFrame, PeopleStream, PeopleTracker
 
 ALL_PERSONS = "all"
 _FRAMES = 20  # that are looked at, at most, where nobody is found

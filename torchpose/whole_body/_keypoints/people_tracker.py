@@ -351,10 +351,7 @@ def _kept(people: TrackedPeople, rows: Int[Tensor, " n"]) -> TrackedPeople:
 
 
 def _owners(
-    groups: Int[Tensor, "G C"],
-    found: PeopleFrame | None,
-    weak: Bool[Tensor, " P"],
-    least: int = 1,
+    groups: Int[Tensor, "G C"], found: PeopleFrame | None, weak: Bool[Tensor, " P"], least: int = 1
 ) -> Bool[Tensor, "P G"]:
     """Return whose detections, so many at least of persons who may give theirs up, are in which groups."""
     if found is None:

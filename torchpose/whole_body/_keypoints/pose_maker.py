@@ -25,11 +25,7 @@ from torchpose.whole_body._keypoints.body_size import outer
 from torchpose.whole_body._keypoints.keypoint_poses import KeypointPoses, KeypointStream
 from torchpose.whole_body._keypoints.known_person import std_of_legs
 from torchpose.whole_body._keypoints.lifted_pose import telling
-from torchpose.whole_body._keypoints.only_camera import (
-    LASTING,
-    relative_covariances,
-    untold_depths,
-)
+from torchpose.whole_body._keypoints.only_camera import LASTING, relative_covariances, untold_depths
 
 _PELVIS = BODY_15.joint("pelvis")
 

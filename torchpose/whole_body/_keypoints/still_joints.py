@@ -59,10 +59,7 @@ class StillJoints(NamedTuple):
 
 
 def with_still_joints(
-    filter: BodyKalmanFilter,
-    state: BodyGaussian,
-    still: StillJoints,
-    frame: KeypointFrame,
+    filter: BodyKalmanFilter, state: BodyGaussian, still: StillJoints, frame: KeypointFrame
 ) -> BodyGaussian:
     """Return predictions in which joints that stood still and are hidden now hardly move.
 

@@ -20,10 +20,7 @@ from torch import Tensor
 from torchpose.math._gaussian import block_diagonal, symmetrise
 from torchpose.math._rotations import matrix_to_quaternion_vector, rotvec_to_matrix
 from torchpose.whole_body._keypoints.joint_elimination import eliminated
-from torchpose.whole_body._keypoints.joint_triangulation import (
-    triangulate_all,
-    triangulate_without,
-)
+from torchpose.whole_body._keypoints.joint_triangulation import triangulate_all, triangulate_without
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     KeypointFrame,
     RigMaps,
