@@ -180,37 +180,23 @@ def check_sequences(
     return frames, start, batched or several
 
 
-def check_observation(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:
-    """Raise unless this is one frame [B, ...] of B sequences, and generators suit.
+def check_observation(
+    observed: Tensor, batch: int, generator: Generators, *, plain: bool, frames: bool = False
+) -> None:
+    """Raise unless this is a frame [B, ...], or are frames [B, T, ...], of B sequences, and generators suit.
 
     Raises:
-        ShapeError, InputError: as `SilhouetteParticleFilter.step`.
+        ShapeError, InputError: as `SilhouetteParticleFilter.step` and `advance`.
     """
-    if len(observed) != batch:
+    sizes = ["B", *["T"] * frames, "C", "H", "W"]
+    if observed.ndim <= frames or len(observed) != batch or (frames and not observed.shape[1]):
         raise ShapeError(
-            f"silhouettes must hold one frame for each of the {batch} elements of the state, "
-            f"[B, C, H, W]; got {list(observed.shape)}"
+            f"silhouettes must hold one frame{' or more' * frames} for each of the {batch} elements of the "
+            f"state, [{', '.join(sizes)}]; got {list(observed.shape)}"
         )
     if plain:
-        check_shape("silhouettes", observed, ["B", "C", "H", "W"])
+        check_shape("silhouettes", observed, sizes)
         _check_silhouettes(observed)
-    check_generators(generator, batch)
-
-
-def check_observations(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:
-    """Raise unless these are one frame or more [B, T, ...] of B sequences, and generators suit.
-
-    Raises:
-        ShapeError, InputError: as `SilhouetteParticleFilter.advance`.
-    """
-    if plain:
-        check_shape("silhouettes", observed, ["B", "T", "C", "H", "W"])
-        _check_silhouettes(observed)
-    if observed.ndim < 2 or len(observed) != batch or observed.shape[1] == 0:
-        raise ShapeError(
-            f"silhouettes must hold one frame or more for each of the {batch} elements of the state, "
-            f"[B, T, C, H, W]; got {list(observed.shape)}"
-        )
     check_generators(generator, batch)
 
 

@@ -32,7 +32,6 @@ from torchpose.whole_body._filters.body_frames import (
     Frame,
     Likelihood,
     check_observation,
-    check_observations,
     check_sequences,
     see_frame,
     seen_until,
@@ -275,7 +274,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
             warn_of_former("advance is of several frames now, filter_frame of one; one frame goes")
             check_observation(silhouettes, len(state.mean), generator, plain=True)
             return self.filter_frame(state, silhouettes, cameras, generator)
-        check_observations(silhouettes, len(state.mean), generator, plain=self._plain)
+        check_observation(silhouettes, len(state.mean), generator, plain=self._plain, frames=True)
         return self._run(state, silhouettes, cameras, generator)
 
     def _run(
