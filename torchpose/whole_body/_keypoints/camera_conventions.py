@@ -8,6 +8,8 @@ one in which the person has the size of one.
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import starmap
 from typing import NamedTuple
 
 import torch
@@ -175,23 +177,23 @@ def pose_conventions(rig: CameraRig) -> Iterator[Convention]:
 
 def _of_images(rig: CameraRig) -> Iterator[Convention]:
     """Yield the conventions of images of the calibrated size."""
-    R, t = rig.rotation, rig.translation
-    yield Convention(
-        "keypoints are v, u, a row and a column", "give u, v: u to the right and v down", R, t,
-        lambda pixels: pixels.flip(-1), True,
+    seen = partial(Convention, rotation=rig.rotation, translation=rig.translation)
+    yield seen(
+        "keypoints are v, u, a row and a column", "give u, v: u to the right and v down",
+        pixels=lambda pixels: pixels.flip(-1), tilts=True,
     )  # fmt: skip
     if None in rig.sizes:
         return
-    h, w = torch.tensor(rig.sizes).to(R).T[..., None]
-    yield Convention(
-        "v is counted from the lower edge of the image", "give height - 1 - v, which is down", R, t,
-        lambda p: torch.stack([p[..., 0], h - 1 - p[..., 1]], -1), True,
+    h, w = torch.tensor(rig.sizes).to(rig.rotation).T[..., None]
+    yield seen(
+        "v is counted from the lower edge of the image", "give height - 1 - v, which is down",
+        pixels=lambda p: torch.stack([p[..., 0], h - 1 - p[..., 1]], -1), tilts=True,
     )  # fmt: skip
-    yield Convention(
+    yield seen(
         "the images are mirrored",
         "give keypoints of images as they were calibrated, u = width - 1 - u (and exchange left and right if "
         "a detector found them in mirrored images)",
-        R, t, lambda p: torch.stack([w - 1 - p[..., 0], p[..., 1]], -1), False, True,
+        pixels=lambda p: torch.stack([w - 1 - p[..., 0], p[..., 1]], -1), exchanges=True,
     )  # fmt: skip
     turns: dict[str, _Pixels] = {
         "upside down": lambda p: torch.stack([w - 1 - p[..., 0], h - 1 - p[..., 1]], -1),
@@ -201,10 +203,10 @@ def _of_images(rig: CameraRig) -> Iterator[Convention]:
         ),
     }
     for turn, pixels in turns.items():
-        yield Convention(
+        yield seen(
             f"the images are {turn} against the calibrated ones",
             "turn the images, or their keypoints, back, or calibrate the turned images",
-            R, t, pixels, True,
+            pixels=pixels, tilts=True,
         )  # fmt: skip
 
 
@@ -241,25 +243,18 @@ def _of_poses(R: Float[Tensor, "C 3 3"], t: Float[Tensor, "C 3"]) -> Iterator[Co
         return -(turn @ point[..., None]).squeeze(-1)
 
     opengl = "cameras look along -z with y up, as those of OpenGL and Blender"
-    yield Convention(
-        "poses are those from camera to world",
-        "a camera file has those from world to camera: the rotation R^T and the translation -R^T t",
-        R.mT, moved(R.mT, t),
-    )  # fmt: skip
-    yield Convention(
-        "translations are the places of the cameras", "a camera at c has the translation -R c", R,
-        moved(R, t),
-    )  # fmt: skip
-    yield Convention(
-        "rotations are those from camera to world, and translations are not",
-        "give the rotations R^T, of Rodrigues vectors with the other sign", R.mT, t,
-    )  # fmt: skip
-    yield Convention(
-        opengl, "give the rotation F R and the translation F t, with F = diag(1, -1, -1)",
-        flip[:, None] * R, flip * t,
-    )  # fmt: skip
-    yield Convention(
-        f"{opengl}, and poses are those from camera to world",
-        "give the rotation F R^T and the translation -F R^T t, with F = diag(1, -1, -1)",
-        flip[:, None] * R.mT, moved(flip[:, None] * R.mT, t),
-    )  # fmt: skip
+    turned = flip[:, None] * R.mT
+    yield from starmap(Convention, [
+        ("poses are those from camera to world",
+         "a camera file has those from world to camera: the rotation R^T and the translation -R^T t",
+         R.mT, moved(R.mT, t)),
+        ("translations are the places of the cameras",
+         "a camera at c has the translation -R c", R, moved(R, t)),
+        ("rotations are those from camera to world, and translations are not",
+         "give the rotations R^T, of Rodrigues vectors with the other sign", R.mT, t),
+        (opengl, "give the rotation F R and the translation F t, with F = diag(1, -1, -1)",
+         flip[:, None] * R, flip * t),
+        (f"{opengl}, and poses are those from camera to world",
+         "give the rotation F R^T and the translation -F R^T t, with F = diag(1, -1, -1)",
+         turned, moved(turned, t)),
+    ])  # fmt: skip
