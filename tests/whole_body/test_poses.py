@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.io.c3d_parser import parse_c3d
 from torchpose.body import BODY_15, Body, centres_of
 from torchpose.camera import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, SkeletonError
@@ -55,6 +56,23 @@ def test_bones_of_kalman_may_have_adapted(tmp_path, method):
     else:
         with pytest.raises(FileFormatError, match="where state puts them"):
             BodyTrack.load(tmp_path / "body.npz")
+
+
+def test_who_was_not_seen_for_a_second_is_missing_in_files_for_others(tmp_path):
+    given = replace(poses(20), fps=5.0)
+    frames = torch.arange(20)
+    given = replace(given, coasting=(frames >= 5) & (frames < 16))
+    for kind in ("trc", "c3d", "bvh"):
+        given.export(tmp_path / f"body.{kind}")
+    lines = (tmp_path / "body.trc").read_text().splitlines()[6:]
+    empty = [not "".join(line.split("\t")[2:]) for line in lines]
+    assert [t for t in range(20) if empty[t]] == [10, 11, 12, 13, 14, 15]
+    residuals = parse_c3d(tmp_path / "body.c3d").points[..., 3]
+    assert [t for t in range(20) if (residuals[t] < 0).all()] == [10, 11, 12, 13, 14, 15]
+    motion = (tmp_path / "body.bvh").read_text().splitlines()[-20:]
+    assert (
+        all(motion[t] == motion[9] for t in range(9, 16)) and motion[8] != motion[9] != motion[16]
+    )
 
 
 def test_failures_are_told_as_in_a_pose_track():

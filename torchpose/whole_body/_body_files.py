@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_choice
@@ -21,6 +21,7 @@ from torchpose.whole_body._body_feet import BodyFeet, TrackedPoints
 BODY_FORMATS = ("trc", "c3d", "bvh")
 UP_AXES = ("z", "y")
 _CENTIMETRES = 100.0
+_PREDICTED = 1.0  # seconds for which somebody whom no camera sees is where they are predicted
 _Z_UP_TO_Y_UP = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # as Pose2Sim turns its axes
 
 
@@ -29,6 +30,7 @@ class BodyMotion3d(NamedTuple):
 
     Attributes:
         body: the body of the person. state: of that body. points: joints, and those of feet.
+        coasting: frames in which no camera saw the person.
         fps: frames per second. first_frame: number of the first frame.
         feet: of the person, None where they were not tracked.
     """
@@ -36,13 +38,24 @@ class BodyMotion3d(NamedTuple):
     body: Body
     state: Float[Tensor, "T D"]
     points: TrackedPoints
+    coasting: Bool[Tensor, " T"]
     fps: float
     first_frame: int
     feet: BodyFeet | None = None
 
+    @property
+    def present(self) -> Int[Tensor, " T"]:
+        """Return the last frame up to each one, as a rule itself, in which the person is not absent."""
+        frames = torch.arange(len(self.coasting), device=self.coasting.device)
+        seen = frames.where(~self.coasting, -1).cummax(0).values
+        return frames.where(frames - seen <= self.fps * _PREDICTED, 0).cummax(0).values
+
 
 def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None) -> None:
     """Write a motion as ``.trc``, ``.c3d`` or ``.bvh``, by the suffix.
+
+    Somebody whom no camera has seen for more than a second is somewhere else than predicted: markers are
+    missing then, and BVH, which has no missing frames, repeats the last pose before.
 
     Args:
         path: the file, which is replaced.
@@ -56,7 +69,10 @@ def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None) -> N
     check_choice("the suffix of a file of bodies", kind, BODY_FORMATS)
     names, points, covariance = motion.points
     turn = _turn_to_y_up(up).to(points)
-    points, names = points @ turn.mT, marker_names(names)
+    present = motion.present
+    absent = present != torch.arange(len(present), device=present.device)
+    points = (points @ turn.mT).masked_fill(absent[:, None, None], torch.nan)
+    names = marker_names(names)
     if kind == "bvh":
         _write_skeleton(path, motion, turn)
     elif kind == "trc":
@@ -117,7 +133,8 @@ def _write_skeleton(path: Path, motion: BodyMotion3d, turn: Float[Tensor, "3 3"]
         toes = [*_toes(motion.feet, motion.points.points3d, feet)]
         parts = torch.cat([parts, feet], 1)
     nodes = _part_nodes(motion.body, toes)
-    parts = turn @ parts
+    present = motion.present.cpu()
+    parts, state = turn @ parts[present], state[present]
     world = torch.stack([parts[:, node.part] for node in nodes], 1)
     parents = [node.node.parent for node in nodes]
     above = world[:, [max(parent, 0) for parent in parents]]

@@ -242,7 +242,8 @@ class BodyTrack:
         TRC and C3D hold `joints3d` as markers with the names of Pose2Sim (RHip, LKnee, CHip, ...), in
         metres and in millimetres, and heels and toes if there are `feet`; the residuals of C3D are standard
         deviations. BVH holds the rigid body that `state` turns, in centimetres. A frame rate that is not
-        known is written as 30.
+        known is written as 30. Where no camera has seen the person for more than a second, markers are
+        missing, and BVH repeats the last pose.
 
         Args:
             path: the file, which is replaced if there is one.
@@ -255,7 +256,8 @@ class BodyTrack:
         """
         self._check_begun()
         motion = BodyMotion3d(
-            self.body, self.state, points_of(self), self.fps or _FPS, self.first_frame, self.feet
+            self.body, self.state, points_of(self), self.coasting, self.fps or _FPS,
+            self.first_frame, self.feet,
         )  # fmt: skip
         write_body_file(path, motion, up)
 
