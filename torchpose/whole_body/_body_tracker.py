@@ -185,7 +185,7 @@ class BodyTracker(OwnPrecisionModule):
         self.notes: tuple[str, ...] = ()
         person = body if body is None or isinstance(body, Body) else load_body(body)
         self._settings = settings_of({
-            "method": method, "fps": self.fps, "cameras": ", ".join(rig.names),
+            "method": method, "fps": self.fps, "cameras": _in_words(rig),
             "body": None if person is None else f"{person.height:.4f} m", "height": height,
             "n_particles": n_particles, "keypoint_std": keypoint_std, "pixel_std": pixel_std,
             **of_kalman, **given, **options,
@@ -542,6 +542,16 @@ class BodyTracker(OwnPrecisionModule):
 
     def extra_repr(self) -> str:
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
+
+
+def _in_words(rig: CameraRig) -> str:
+    """Return the names of cameras, and roughly where they are, where they look to, and focal lengths."""
+    centres = -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
+    numbers = torch.cat([centres, rig.rotation[:, 2], rig.matrix[:, 0, :1]], -1).tolist()
+    return ", ".join(
+        f"{name} at {x:.2f} {y:.2f} {z:.2f} m along {a:.2f} {b:.2f} {c:.2f}, {focal:.0f} px"
+        for name, (x, y, z, a, b, c, focal) in zip(rig.names, numbers, strict=True)
+    )
 
 
 def _names(names: Sequence[str] | None) -> tuple[str, ...] | None:

@@ -1024,14 +1024,17 @@ def test_a_height_beside_a_body_is_refused(four, method):
 def test_states_of_a_tracker_with_other_options_are_refused(four):
     mine = kalman(four.rig)
     state, _ = mine.step(mine.init(), keypoints=four.keypoints[0])
+    moved = copy.deepcopy(four.rig)
+    moved.translation[1, 2] += 0.5
     others = {
         f"fps=15.0, got that of a tracker with fps={FPS:g}": BodyTracker(
             four.rig, "kalman", fps=15
         ),
-        "with cameras='{0}, {1}', got .* cameras='{0}, {1}, .*'".format(*four.rig.names): kalman(
-            four.rig.select([0, 1])
-        ),
+        "with cameras='{} at [^']*{} at [^']* px', got .* cameras='.*'".format(
+            *four.rig.names
+        ): kalman(four.rig.select([0, 1])),
         "with cameras=.*got that of a tracker with cameras=": kalman(four.rig.select([1, 0, 2, 3])),
+        f"{four.rig.names[1]} at .*got that of a tracker with cameras='": kalman(moved),
         "pixel_std=9, got that of a tracker with pixel_std=None": kalman(four.rig, pixel_std=9),
         "keypoint_std=0.1, got": kalman(four.rig, keypoint_std=0.1),
         "body='1.9000 m', got": kalman(four.rig, body=Body.of_height(BODY_15, 1.9)),
