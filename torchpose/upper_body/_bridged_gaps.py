@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.filters._lengths import inside_lengths
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
 from torchpose.upper_body._face_points import FacePoints
@@ -67,8 +68,7 @@ def bridged_over_gaps(
     """
     inside = torch.ones_like(measured.mask[..., :1])
     if lengths is not None:
-        frames = torch.arange(inside.shape[1], device=inside.device)
-        inside = (frames < lengths.to(inside.device)[:, None])[..., None]
+        inside = inside_lengths(lengths.to(inside.device), inside.shape[1])[..., None]
     gaps = _find_gaps(measured.mask & inside, rate)
     if measured.absence is not None:
         gaps.inside[..., HANDS] &= measured.absence.log_inside >= 0

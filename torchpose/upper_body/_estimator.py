@@ -13,6 +13,7 @@ from torchpose._core.checks import check_rate
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._virtual_camera import BodyView
 from torchpose.errors import CameraError, PriorError
+from torchpose.filters._lengths import held_past_lengths, inside_lengths
 from torchpose.filters._outputs import FilterOutput, StepOutput
 from torchpose.filters._recursive_filter import Generators
 from torchpose.math._rotations import (
@@ -345,8 +346,7 @@ def repeat_poses(poses: SeenPoses, lengths: Int[Tensor, " B"]) -> SeenPoses:
 
 def _repeat_output(out: FilterOutput, lengths: Int[Tensor, " B"]) -> FilterOutput:
     mean, log_weights = _held((out.mean, out.log_weights), lengths)
-    frames = torch.arange(out.mean.shape[1], device=lengths.device)
-    inside = frames < lengths[:, None]
+    inside = inside_lengths(lengths, out.mean.shape[1])
     return FilterOutput(
         mean,
         log_weights,
@@ -360,11 +360,7 @@ def _repeat_output(out: FilterOutput, lengths: Int[Tensor, " B"]) -> FilterOutpu
 
 def _held(values: Iterable[Tensor], lengths: Int[Tensor, " B"]) -> list[Tensor]:
     """Return values [B, T, ...] with those of the last frame of each sequence past its length."""
-    values = list(values)
-    frames = torch.arange(values[0].shape[1], device=values[0].device)
-    held = frames.minimum(lengths.to(frames)[:, None] - 1)
-    rows = torch.arange(len(held), device=held.device)[:, None]
-    return [value[rows, held] for value in values]
+    return [held_past_lengths(value, lengths.to(value.device)) for value in values]
 
 
 def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:

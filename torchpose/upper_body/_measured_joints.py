@@ -24,6 +24,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
 from torchpose.errors import InputError
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._measurements import check_lengths
 from torchpose.io._keypoints import is_filled
 from torchpose.math._gaussian import block_diagonal
@@ -406,10 +407,9 @@ def check_gaps(
         InputError: the sequence and the frames are named.
     """
     batch, n_frames, _ = measured.shape
-    frames = torch.arange(n_frames, device=measured.device).expand(batch, -1)
-    inside = torch.ones_like(frames, dtype=torch.bool)
+    inside = torch.ones_like(measured[..., 0])
     if lengths is not None:
-        inside = frames < lengths.to(measured.device)[:, None]
+        inside = inside_lengths(lengths.to(measured.device), n_frames)
     seen = measured.any(-1) & inside
     empty = torch.nonzero(~seen.any(1)).flatten().tolist()
     several = batch > 1
@@ -421,8 +421,9 @@ def check_gaps(
         )
     if max_gap is None:
         return
-    last_seen = torch.where(seen, frames, torch.full_like(frames, -1)).cummax(1).values
-    gap = torch.where(inside, frames - last_seen, torch.zeros_like(frames))
+    frames = torch.arange(n_frames, device=measured.device).expand(batch, -1)
+    last_seen = frames.where(seen, -1).cummax(1).values
+    gap = (frames - last_seen).where(inside, 0)
     if bool((gap > max_gap * fps).any()):
         b, t = (int(i) for i in torch.nonzero(gap == gap.max())[0])
         raise InputError(

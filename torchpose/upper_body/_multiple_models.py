@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._outputs import first_not_finite
 from torchpose.priors._arms import ArmPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -178,8 +179,8 @@ class MultipleModelFilter(Estimator):
             )
         clues = _clues(told, predicted, poses, measured)
         if lengths is not None:
-            frames = torch.arange(clues.shape[1], device=clues.device)
-            clues = clues * (frames < lengths.to(clues.device)[:, None])[..., None]
+            inside = inside_lengths(lengths.to(clues.device), clues.shape[1])
+            clues = clues * inside[..., None]
         sums = self._sums(self._usual.expand(len(clues), -1), clues)
         sums = sums + self._later_sums(clues) - clues
         return repeat_last(self._mixed(sums, poses, seen, bodies, measured), lengths)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.filters._lengths import inside_lengths
 from torchpose.upper_body._measured_joints import MeasuredJoints
 
 _REACH = 4 / 30  # seconds before and after a frame
@@ -46,8 +47,7 @@ def averaged_over_frames(
     """
     inside = torch.ones_like(measured.mask[..., 0])
     if lengths is not None:
-        frames = torch.arange(inside.shape[1], device=inside.device)
-        inside = frames < lengths.to(inside.device)[:, None]
+        inside = inside_lengths(lengths.to(inside.device), inside.shape[1])
     uv = _averaged(measured.uv, measured.mask & inside[..., None], measured.cov, reach)
     middle = measured.middle
     if middle is not None:

@@ -4,9 +4,10 @@ import re
 from collections.abc import Iterable
 
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, arange
+from torch import Tensor
 
 from torchpose._core.wording import counted
+from torchpose.filters._lengths import inside_lengths
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 _TAKEN, _EXCHANGED = "as if missing", "left and right exchanged back in"
@@ -26,9 +27,7 @@ def outlier_notes(
     """
     outliers = probability < 0.5
     if lengths is not None:
-        inside = (
-            arange(outliers.shape[1], device=outliers.device) < lengths.to(outliers.device)[:, None]
-        )
+        inside = inside_lengths(lengths.to(outliers.device), outliers.shape[1])
         outliers = outliers & inside[..., None]
         exchanged = exchanged & inside if isinstance(exchanged, Tensor) else exchanged
     counts, said = outliers.flatten(0, 1).sum(0).tolist(), []

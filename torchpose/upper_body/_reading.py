@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import InputError
+from torchpose.filters._lengths import inside_lengths
 from torchpose.math._rotations import RotationOrder
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.upper_body._estimator import (
@@ -244,8 +245,8 @@ def note_collapse(track: PoseTrack) -> PoseTrack:
     if method is None or not method.particles:
         return track
     size = track.effective_sample_size
-    frames = torch.arange(size.shape[1], device=size.device)
-    counted = size.isfinite() & (frames < track.lengths.to(size.device)[:, None])[..., None]
+    inside = inside_lengths(track.lengths.to(size.device), size.shape[1])
+    counted = size.isfinite() & inside[..., None]
     few = (counted & (size < _FEW)).sum(1)
     collapsed = few > _COLLAPSED_SHARE * counted.sum(1)
     if not bool(collapsed.any()):

@@ -17,6 +17,7 @@ from torchpose.camera._virtual_camera import (
     to_view,
     view_body,
 )
+from torchpose.filters._lengths import inside_lengths
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, window_measurements
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -80,8 +81,7 @@ def see_in_view(
     """
     uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix_like(measured.uv)
     if lengths is not None:
-        frames = torch.arange(mask.shape[1], device=mask.device)
-        mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
+        mask = mask & inside_lengths(lengths.to(mask.device), mask.shape[1])[..., None]
     start = start % mask.shape[1]
     regression: Regression | None
     model, regression = _kept_path(prior, layout, measurement_cov, uv)
