@@ -15,6 +15,7 @@ from torchpose.io._formats.axes import (
     default_axes,
     heading,
     note_on_lying,
+    note_on_mirroring,
 )
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
@@ -66,6 +67,28 @@ def test_axes_that_exchange_up_and_forwards_are_doubted(written, said):
     [note] = note_on_lying(wrong, NAMES)
     assert "90 degrees" in note and "axes.txt" in note
     assert note_on_lying(right, NAMES) == [] == note_on_lying(wrong[:, 1:3], NAMES[1:3])
+
+
+def test_without_hips_the_head_is_compared_with_the_shoulders():
+    lying = eight(0.0, 0.4)
+    lying[:, 3, 2] = -0.3
+    [note] = note_on_lying(lying, UPPER_BODY)
+    assert "from the shoulders to the head it is 90 degrees" in note
+    assert note_on_lying(eight(-0.25, 0.4), UPPER_BODY) == []
+
+
+@pytest.mark.parametrize("ends", [("hand",), ("big_toe",), ("foot", "wrist")])
+def test_mirrored_joints_are_told_from_turned_ones(ends):
+    parts, sides = ("ankle", *ends), {"left": 0.2, "right": -0.2}
+    names = (*NAMES, *(f"{part}_{side}" for part in parts for side in sides))
+    more = [[x, 1.0, -0.1 * (part in ends)] for part in parts for x in sides.values()]
+    facing = torch.cat([FACING, torch.tensor(more, dtype=torch.float64)]).expand(3, -1, 3)
+    turned = facing @ about_vertical(2.5, 1).mT
+    for mirror in ([-1.0, 1, 1], [1.0, 1, -1]):
+        [note] = note_on_mirroring(turned * torch.tensor(mirror), names)
+        assert "mirrored" in note and "no --axes corrects" in note
+    assert note_on_mirroring(turned, names) == [] == note_on_mirroring(facing[:, :5], NAMES)
+    assert note_on_mirroring(facing[:, :1], NAMES[:1]) == []
 
 
 def test_a_camera_is_never_turned():

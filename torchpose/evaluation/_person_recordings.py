@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpose._core.wording import counted
 from torchpose.io._recordings import (
-    BACK_TO_CAMERA,
+    DOUBTS,
     Recording,
     find_recordings,
     notes_on_unread_files,
@@ -80,8 +80,9 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
     ] * bool(others)
     doubts = [*same_names(known), *unstated_rates(known), *notes_on_unread_files(paths, found)]
     notes += [f"{note}." for note in doubts]
-    turned = [r for r in known if BACK_TO_CAMERA in r.notes]
-    notes += [f"In {len(turned)} of {len(known)} recordings: {BACK_TO_CAMERA}."] * bool(turned)
+    for doubt in DOUBTS:
+        found_in = [note for r in known for note in r.notes if note.startswith(doubt)]
+        notes += [f"In {len(found_in)} of {len(known)} recordings: {n}." for n in found_in[:1]]
     return KnownPersons(known, notes)
 
 

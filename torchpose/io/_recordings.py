@@ -19,12 +19,15 @@ from torchpose._core.wording import first_of
 from torchpose.errors import FileFormatError, InputError
 from torchpose.io._formats.axes import (
     AXES,
+    LIES,
+    MIRRORED,
     axes_rotation,
     body_unit,
     check_upright,
     default_axes,
     heading,
     note_on_lying,
+    note_on_mirroring,
 )
 from torchpose.io._formats.joint_tables import header_joints
 from torchpose.io._formats.kinect_csv import ROW_LENGTHS, is_row, read_kinect_csv
@@ -56,11 +59,12 @@ _READERS: dict[str, Callable[[Path], list[RawRecording]]] = {
 _SUFFIXES = tuple(_READERS)
 _AXES_FILE = "axes.txt"
 _SNIFFED = 65536  # bytes from the start of a file that tell whether it is a recording
-BACK_TO_CAMERA = (
+_BACK_TO_CAMERA = (
     "by the shoulders the person's back is to the camera; if it is not, the joints are mirrored, or left and "
     "right exchanged"
 )
-"""The note on a recording of joints that are perhaps mirrored."""
+DOUBTS = (LIES, MIRRORED, _BACK_TO_CAMERA)
+"""How notes begin on recordings whose axes or sides are perhaps wrong."""
 _BESIDE_BODY = 0.3  # most distance of a centred body's origin from its joints, over their extent
 _SHOWN_JOINTS, _LISTED = 3, 2  # joints, and files, that a note names
 _BACK = 2 * math.pi / 3  # radians of the mean heading, from which on the back is to the camera
@@ -357,7 +361,11 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
         raise type(error)(f"{where}: {error}") from error
     tensor = tensor @ rotation.mT
     check_upright(where, tensor, raw.names)
-    notes += note_on_lying(tensor, raw.names) or _notes_on_heading(tensor, raw.names)
+    notes += (
+        note_on_lying(tensor, raw.names)
+        or note_on_mirroring(tensor, raw.names)
+        or _notes_on_heading(tensor, raw.names)
+    )
     skeleton = identify_skeleton(raw.names)
     weights = None
     if raw.weights is not None:
@@ -374,7 +382,7 @@ def _notes_on_heading(joints: Tensor, names: Sequence[str]) -> list[str]:
     angle = heading(joints, names)
     if angle is None or abs(angle) < _BACK:
         return []
-    return [BACK_TO_CAMERA]
+    return [_BACK_TO_CAMERA]
 
 
 def _check_shapes(raw: RawRecording) -> None:

@@ -89,18 +89,25 @@ def heading(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> float | Non
     Returns:
         The angle in (-pi, pi], radians, or None without shoulders and hips.
     """
+    unit = _across(joints, names)
+    if unit is None:
+        return None
+    x, z = unit[unit.isfinite().all(-1)].mean(0).tolist()
+    return math.atan2(z, x)
+
+
+def _across(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> Float[Tensor, "T 2"] | None:
+    """Return unit vectors (x, z) from the right to the left shoulder (or hip), NaN where unknown."""
     where = {name: i for i, name in enumerate(canonical_names(names))}
     for part in ("shoulder", "hip"):
         left, right = where.get(f"{part}_left"), where.get(f"{part}_right")
         if left is None or right is None:
             continue
         across = (joints[:, left] - joints[:, right])[:, [0, 2]]
-        across = across[torch.isfinite(across).all(-1)]
         length = across.norm(dim=-1, keepdim=True)
-        unit = (across / length)[(length > 1e-6).squeeze(-1)]
-        if len(unit):
-            x, z = unit.mean(0).tolist()
-            return math.atan2(z, x)
+        unit = across / length.where(length > 1e-6, math.nan)
+        if bool(unit.isfinite().any()):
+            return unit
     return None
 
 
@@ -138,27 +145,60 @@ def check_upright(where: str, joints: Float[Tensor, "T J 3"], names: Sequence[st
 
 
 def note_on_lying(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> list[str]:
-    """Return a note if the head is rather beside the hips than above them, by the median over frames.
+    """Return a note if the head is rather beside the body than above it, by the median over frames.
 
-    So it is in wrong axes that exchange up and forwards, which put nobody upside down.
+    So it is in wrong axes that exchange up and forwards, which put nobody upside down. The head is compared
+    with the hips, without hips with the shoulders, from which a neck is too near.
 
     Args:
         joints: [T, J, 3] in camera axes (y down), metres. names: the J names.
     """
     index = {name: i for i, name in enumerate(canonical_names(names))}
-    tops = [name for name in ("head", "upper_neck", "neck", "shoulder_center") if name in index]
-    hips = [index[name] for name in ("hip_left", "hip_right", "hip_center") if name in index]
-    if not tops or not hips:
+    tops = [p for p in ("head", "upper_neck", "neck", "shoulder_center") if p in index]
+    parts: tuple[str, ...] = ("hip_left", "hip_right", "hip_center")
+    if not index.keys() & parts and "head" in index:
+        parts = ("shoulder_left", "shoulder_right")
+    below = [part for part in parts if part in index]
+    if not tops or not below:
         return []
-    line = joints[:, hips].nanmean(1) - joints[:, index[tops[0]]]
+    line = joints[:, [index[name] for name in below]].nanmean(1) - joints[:, index[tops[0]]]
     lean = _median(torch.atan2(line[:, [0, 2]].norm(dim=-1), line[:, 1]))
     if lean is None or lean < _LYING:
         return []
+    part = below[0].split("_")[0]
     return [
-        f"by these axes the person lies: from the hips to the {tops[0]} it is {math.degrees(lean):.0f} "
-        "degrees from the vertical in the median frame; of somebody who stands or sits the axes are "
-        f"others, which --axes says ({', '.join(AXES)}), or a file axes.txt in the folder"
+        f"{LIES}: from the {part}s to the {tops[0]} it is {math.degrees(lean):.0f} degrees from the vertical "
+        "in the median frame; of somebody who stands or sits the axes are others, which --axes says "
+        f"({', '.join(AXES)}), or a file axes.txt in the folder"
     ]
+
+
+def note_on_mirroring(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> list[str]:
+    """Return a note if toes and hands are behind the body by the shoulders, as those of mirrored joints are.
+
+    It is told by the mean of how far toes are before ankles, and hands before shoulders, each the median over
+    the frames.
+
+    Args:
+        joints: [T, J, 3] in camera axes (y down), metres. names: the J names.
+    """
+    index = {name: i for i, name in enumerate(canonical_names(names))}
+    across = _across(joints, names)
+    if across is None:
+        return []
+    forwards = torch.stack([across[:, 1], -across[:, 0]], -1)
+    found = []
+    for base, ends in (("ankle", ("toe", "big_toe", "foot")), ("shoulder", ("hand", "wrist"))):
+        end = next((name for name in ends if f"{name}_left" in index), "")
+        sides = [
+            side for side in ("left", "right") if {f"{base}_{side}", f"{end}_{side}"} <= {*index}
+        ]
+        steps = [joints[:, index[f"{end}_{s}"]] - joints[:, index[f"{base}_{s}"]] for s in sides]
+        reach = [(step[:, [0, 2]] * forwards).sum(-1) for step in steps]
+        median = _median(torch.cat(reach)) if reach else None
+        if median is not None:
+            found.append(median)
+    return [MIRRORED] if found and sum(found) / len(found) < -_BEHIND else []
 
 
 def _raise_upside_down(where: str, top: str, below: str, drop: float) -> None:
@@ -170,7 +210,16 @@ def _raise_upside_down(where: str, top: str, below: str, drop: float) -> None:
     )
 
 
+LIES = "by these axes the person lies"
+"""How the note on a recording begins in which somebody lies."""
+MIRRORED = (
+    "by the shoulders toes and hands are behind the body: the joints are mirrored, as in left-handed axes, "
+    "which no --axes corrects (change the sign of one coordinate in the file), or left and right are "
+    "exchanged"
+)
+"""The note on a recording of joints that are mirrored."""
 _LYING = math.pi / 3  # from the vertical
+_BEHIND = 0.03  # metres; of 1,276 recordings the mean is never below 0.013
 METRES_PER = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _TEXT = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 _LARGEST = 5.0  # metres: nobody spans more
