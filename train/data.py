@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
-from torchpose.errors import InputError, OverlapError
+from torchpose.errors import InputError
 from torchpose.io import Recording, read_recordings
 from torchpose.io._recordings import find_recordings, notes_on_unread_files
 from torchpose.learning._curation import (
@@ -17,6 +17,7 @@ from torchpose.learning._curation import (
     pick_persons,
     refuse_leaks,
 )
+from torchpose.learning._curation.splits import refuse_both_sides
 from torchpose.learning._recipes import VERSION, MixtureTask, UpperBodyRecipe
 from torchpose.learning._recipes.choosing import expand_path, fingerprint
 from torchpose.learning._samplers import SampleSource, cached
@@ -185,11 +186,7 @@ def split(
     known = sorted({r.person_id for r in recordings})
     out = pick_persons(held_out, known)
     fitted = set(known) - out if persons is None else pick_persons(persons, known)
-    both = sorted(fitted & out)
-    if both:
-        raise OverlapError(
-            f"{', '.join(both)}: held out, but to be fitted to as well; name each person on one side"
-        )
+    refuse_both_sides(fitted, out)
     if not fitted:
         raise InputError(
             f"nobody is left to fit to: all of {', '.join(known)} are held out; hold fewer out"

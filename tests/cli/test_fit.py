@@ -106,6 +106,17 @@ def test_noise_is_learnt_anew_for_a_prior_that_is_there(torchpose, files, tmp_pa
     assert stranger.code != 0 and "recordings#p2" in stranger.err
 
 
+def test_notes_stay_without_curation(torchpose, files, tmp_path):
+    for path in (files / "recordings").iterdir():
+        with np.load(path) as archive:
+            np.savez(tmp_path / path.name, **{**archive, "joints": 1000 * archive["joints"]})
+    done = torchpose(
+        "fit", tmp_path, "--out", tmp_path / "p.safetensors", *QUICK, "--curate", "false"
+    )
+    assert done.code == 0, done.err
+    assert "note     taken for millimetres" in done.out and "(2 recordings, " in done.out
+
+
 def test_persons_are_left_out_by_name(torchpose, files, tmp_path):
     out = tmp_path / "p.safetensors"
     line = ("fit", files / "recordings", "--out", out, *RECIPE, "--without", "p2")
@@ -190,6 +201,10 @@ BAD_INPUT = {
     "no calibration": (
         ["{files}/recordings", "--noise", "none", "--folds", "3"],
         "--folds is for the calibration, and --noise none does without; leave it out",
+    ),
+    "nothing curated": (
+        ["{files}/recordings", "--curate", "false", "--harmonise", "true"],
+        "--harmonise is for curated recordings",
     ),
     "no components": (["{files}/recordings", "--components", "0"], "at least 1"),
     "no samples": (["{files}/recordings", "--samples", "0"], "at least 1"),

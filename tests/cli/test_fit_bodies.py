@@ -9,12 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from tests.full_disk import files_up_to
 from tests.priors.motions import motion
 from tests.priors.performances import performances
 from torchpose._core.tensor_file import format_of
 from torchpose.body import BODY_15, Body
 from torchpose.cli._fit_bodies import KINDS, command, recorded_command
+from torchpose.errors import OutputError
 from torchpose.learning._gplvm_fit import GPLVMFit
+from torchpose.learning._recipes.manifold import (
+    ManifoldFitting,
+    ManifoldPoses,
+    ManifoldRecipe,
+    run_to_end,
+)
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
 from torchpose.priors._actions.postures import posture_angles, posture_to_state
 from torchpose.priors._body_motion import BodyMotion
@@ -272,6 +280,27 @@ def test_lightning_is_not_imported(walks, tmp_path):
         (("limbs", "{walks}", "--actions", "hop"), "no recording of hop; there are walk"),
         (("actions", "{walks}"), "--actions"),
         (("actions", "{walks}", "--actions", "walk", "--postures", "arms"), "body or joints"),
+        (
+            ("actions", "{walks}", "--actions", "walk", "--stay", 0.5),
+            "--stay is for a bank of several",
+        ),
+        (
+            ("manifold", "{walks}", "--held-out", "p2", "--validation", 1),
+            "--validation is for fits without",
+        ),
+        (
+            ("limbs", "{walks}", "--persons", "p0", "p2", "--held-out", "p2"),
+            "to be fitted to as well",
+        ),
+        (
+            (
+                "limbs",
+                "{walks}",
+                "--without-files",
+                *(f"p{i}_{j}" for i in range(3) for j in range(3)),
+            ),
+            "names all of the recordings",
+        ),
         (("actions",), "missing: DIR"),
         (("body", "{walks}", "--n-components", 3), "n_components must be even"),
         (("body", "{walks}", "--fps", 0), "fps must be positive"),
@@ -282,6 +311,54 @@ def test_bad_input_is_refused_in_one_line(torchpose, walks, tmp_path, line, said
     line = [str(part).format(walks=walks) for part in line]
     done = torchpose("fit", *line, "--out", tmp_path / "bad.safetensors")
     assert done.code == 2 and said in done.err and len(done.err.splitlines()) == 1, done.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_held_out_persons_do_the_actions(torchpose, exercises, tmp_path):
+    with np.load(exercises / "p2_1.npz") as values:
+        np.savez(tmp_path / "a.npz", **{**values, "subject": "p3"})
+    line = (
+        "fit",
+        "limbs",
+        exercises,
+        tmp_path / "a.npz",
+        "--actions",
+        "action0",
+        "--held-out",
+        "p3",
+    )
+    done = torchpose(*line, "--out", tmp_path / "out" / "x.safetensors")
+    assert done.code == 2 and "(set#p3) did any of the actions" in done.err
+
+
+@pytest.mark.parametrize("kind", ["manifold", "limbs", "actions", "body"])
+def test_what_reading_assumed_is_told(kind, torchpose, walks, exercises, tmp_path):
+    """Without this nothing says that bodies lie, or are mirrored."""
+    folder, out = tmp_path / "recordings", tmp_path / "mine.safetensors"
+    folder.mkdir()
+    for path in (exercises if kind == "actions" else walks).iterdir():
+        with np.load(path) as values:
+            about_x = [[1, 0, 0], [0, np.cos(1.3), -np.sin(1.3)], [0, np.sin(1.3), np.cos(1.3)]]
+            np.savez(
+                folder / path.name,
+                **{**values, "joints": 1000 * values["joints"] @ np.transpose(about_x)},
+            )
+    (folder / "more.csv").write_text("nothing")
+    quiet = ("--pictures", "false") if kind in DRAWN else ()
+    done = torchpose("fit", kind, folder, "--out", out, *QUICK[kind], *quiet)
+    assert done.code == 0, done.err
+    assert "note: by these axes the person lies" in done.out
+    assert "note: taken for millimetres" in done.out
+    assert (
+        f"note: not read, since the folder holds recordings as .npz: {folder}/more.csv" in done.out
+    )
+
+
+def test_a_full_disk_is_told(walks, tmp_path):
+    poses = ManifoldPoses.gather([str(walks)], persons=["p0"], validation=1, frames=30)
+    fitting = ManifoldFitting(poses, ManifoldRecipe(steps=1))
+    with files_up_to(1000), pytest.raises(OutputError, match="kept: cannot be written"):
+        run_to_end(fitting, tmp_path / "kept", False)
     assert not list(tmp_path.iterdir())
 
 

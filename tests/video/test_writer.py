@@ -1,6 +1,5 @@
 """Files that are written: what they hold, when they appear, and what happens when they cannot."""
 
-import contextlib
 import errno
 from fractions import Fraction
 
@@ -9,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.full_disk import files_up_to
 from tests.video.make import number_of, numbered
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
 from torchpose.video import VideoWriter, open_video
@@ -274,18 +274,6 @@ def test_disk_full(tmp_path, at):
     writer.close()
     with pytest.raises(InputError, match="is closed"):
         writer.write(numbered(0))
-
-
-@contextlib.contextmanager
-def files_up_to(size):
-    """A limit of the system to the size of files, met as a full disk is met."""
-    resource = pytest.importorskip("resource", reason="limits of the system")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("part", ["while frames come", "when it is finished"])

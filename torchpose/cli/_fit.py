@@ -184,10 +184,11 @@ def _curated(
     recordings: list["Recording"], settings: dict[str, Any] | None
 ) -> tuple[list["Recording"], str, dict[str, Any]]:
     """Return curated recordings, a description of the omissions, and facts about them for the card."""
+    from torchpose.learning._curation.curate import CurationSettings, curate, notes_on_recordings
+
     if settings is None:
-        return recordings, f"read     {_counts(recordings)}", {}
-    from torchpose.learning._curation import curate
-    from torchpose.learning._curation.curate import CurationSettings
+        notes = [f"note     {note}" for note in notes_on_recordings(recordings)]
+        return recordings, "\n".join([f"read     {_counts(recordings)}", *notes]), {}
 
     curated = curate(recordings, CurationSettings(**settings))
     report = curated.report
@@ -223,6 +224,10 @@ def _check_options(given: Given) -> None:
         raise InputError("--window-components applies only with --noise learnt")
     if values["noise"] == "none":
         given.refuse(_OF_CALIBRATION, "the calibration, and --noise none does without")
+    if not values["curate"]:
+        given.refuse(
+            ("harmonise",), "curated recordings, and --curate false takes them as they are"
+        )
     if values["noise_of"]:
         given.refuse(_OF_MIXTURES, "new mixtures, and --noise-of keeps those of a prior")
 

@@ -31,6 +31,7 @@ KINDS = tuple(_EXAMPLES)
 PYTHON_ONLY = frozenset({"gamma_x", "optimiser", "learning_rate"})
 """Settings of recipes that only Python and the training loop have."""
 
+_OF_BANKS = ("stay", "spread", "background", "evidence_rate", "gate_dimensions")
 _WORDS = ("persons", "held_out", "actions", "without")
 
 
@@ -65,12 +66,17 @@ def _results(
     given: Given, pictures: bool
 ) -> "Iterator[tuple[ResultsFolder, Path, dict[str, str]]]":
     """Return the folder of the model, its file, and its name, licence and command; all in use."""
+    from torchpose.io._recordings import find_recordings, notes_on_unread_files
     from torchpose.learning._fit_files import check_fit_file, fit_results
+    from torchpose.learning._recipes.choosing import expand_path
 
     values = given.values
     out = check_fit_file(values["out"])
     facts = {"name": values["name"] or out.stem, "licence": values["licence"]}
     with fit_results(out, given.files(), pictures) as results:
+        paths = [expand_path(path) for path in values["recordings"]]
+        for note in notes_on_unread_files(paths, find_recordings(paths)):
+            print(f"note: {note}", flush=True)
         yield results, out, facts | {"command": recorded_command(given)}
 
 
@@ -127,6 +133,8 @@ def fit_manifold(
         taken_up,
     )
 
+    if choice["held_out"]:
+        given.refuse(("validation",), "fits without persons held out, and --held-out names some")
     with _results(given, pictures) as (results, file, facts):
         settings, pictures = ManifoldRecipe(**recipe), pictures_possible(pictures)
         poses = ManifoldPoses.gather(recordings, **choice, progress=show_progress())
@@ -224,6 +232,8 @@ def fit_actions(
     from torchpose.learning._fit_files import write_action_files
     from torchpose.learning._recipes import actions
 
+    if len(set(choice["actions"])) == 1:
+        given.refuse(_OF_BANKS, "a bank of several actions, and there is one")
     with _results(given, pictures) as (results, file, facts):
         if postures not in ("body", "joints"):
             raise InputError(f"--postures must be body or joints, got {postures!r}")

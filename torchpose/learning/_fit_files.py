@@ -14,7 +14,7 @@ from torchpose.learning._body_motion_fit import BodyMotionRecipe
 from torchpose.learning._model_card import MODES, BodyModel, body_card, model_card
 from torchpose.learning._recipes.actions import FittedActions
 from torchpose.learning._recipes.body_motion import RecordedMotion, fit_motion, motion_summary
-from torchpose.learning._recipes.gaps import notes_on_gaps
+from torchpose.learning._recipes.gaps import notes_on_motion
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
@@ -123,7 +123,7 @@ def write_manifold_files(
 
     pictures = {f"{Path(file).stem}.png": draw} if picture else None
     written = write_fit(manifold, body_card(manifold, file=file), results, file, pictures)
-    notes = notes_on_gaps([*fitting.data.fitted, *fitting.data.held_out])
+    notes = notes_on_motion([*fitting.data.fitted, *fitting.data.held_out])
     return f"{fitting.summary(manifold)}\n{_written(results, written, notes)}"
 
 
@@ -181,7 +181,7 @@ def write_action_files(
     pictures = {name: drawing(action) for name, action in names.items()} if picture else None
     card = body_card(found, facts.get("name", ""), file=file)
     written = write_fit(found, card, results, file, pictures)
-    notes = notes_on_gaps(fitted.performances.recordings)
+    notes = notes_on_motion(fitted.performances.recordings)
     return f"{fitted.summary()}\n{_written(results, written, notes)}"
 
 

@@ -14,6 +14,7 @@ from torchpose.learning._curation import (
     refuse_leaks,
     split_persons,
 )
+from torchpose.learning._curation.splits import same_names
 
 PERSONS = ("ann", "bob", "cyd")
 
@@ -64,6 +65,13 @@ def test_one_name_in_several_folders_is_doubtful():
     split_persons(days, ["monday#ann", "tuesday#ann"])  # on one side
     leave_one_person_out([replace(r, source=f"{r.person}/set@0") for r in days])
     leave_one_person_out([replace(r, person="") for r in days])
+
+
+def test_names_that_differ_in_case_are_doubtful():
+    both = [recording(person, "a", moving(120)) for person in ("ann", "Ann")]
+    [note] = same_names(both)
+    assert note.startswith("Ann#, ann# count as 2 persons, since their names differ in case")
+    assert same_names(everybody()) == []
 
 
 def test_companions_of_a_test_person_are_on_neither_side():

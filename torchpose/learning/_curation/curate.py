@@ -1,6 +1,5 @@
 """Curate recordings: apply all checks and changes in order, and report them."""
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -31,6 +30,7 @@ from torchpose.learning._curation.report import CurationReport, Drop, Size, drop
 from torchpose.learning._curation.splits import (
     check_kinds,
     describe_duplicate,
+    notes_of_reading,
     refuse_shared_between_persons,
     same_names,
     skeleton_counts,
@@ -40,7 +40,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
 _RATE = 30.0  # of recordings that do not say: a Kinect's
-_NUMBERS = re.compile(r"\d[\d.]*(?:(?:, |-)\d[\d.]*)*(?: and \d+ more places)?")
 _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")
 
 
@@ -125,7 +124,7 @@ def curate(recordings: Sequence[Recording], settings: CurationSettings = DEFAULT
     if settings.mirror:
         kept += [mirrored(r) for r in kept]
     report = CurationReport(
-        _size(recordings), after, tuple(drops), _notes(recordings), settings._asdict()
+        _size(recordings), after, tuple(drops), notes_on_recordings(recordings), settings._asdict()
     )
     return Curated(kept, report)
 
@@ -274,20 +273,14 @@ def _size(recordings: Sequence[Recording]) -> Size:
     return Size(persons, len(recordings), sum(map(len, recordings)), joints)
 
 
-def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
+def notes_on_recordings(recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Return notes on all recordings together, then those of single ones, alike ones once."""
     notes = [*_same_folders(recordings), *same_names(recordings), *unstated_rates(recordings)]
     sets = skeleton_counts(recordings)
     if len(sets) > 1:
         mixed = ", ".join(f"{name} {n}" for name, n in sets.items())
         notes.append(f"joint sets are mixed: {mixed} recordings; necks are converted to one kind")
-    alike: dict[str, list[str]] = {}
-    for note in (note for r in recordings for note in r.notes):
-        alike.setdefault(_NUMBERS.sub("#", note), []).append(note)
-    for same in sorted(alike.values(), key=len, reverse=True):
-        first = ", numbers of the first" if len(set(same)) > 1 else ""
-        notes.append(f"{same[0]} ({len(same)} recording{'s' * (len(same) != 1)}{first})")
-    return tuple(notes)
+    return (*notes, *notes_of_reading(recordings))
 
 
 def _same_folders(recordings: Sequence[Recording]) -> list[str]:

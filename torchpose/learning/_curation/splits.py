@@ -1,5 +1,6 @@
 """Split persons into training and test without leaks: duplicates, shared recordings, kinds of joints."""
 
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.wording import first_of
+from torchpose._core.wording import counted, first_of
 from torchpose.errors import InputError, OverlapError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import label, measured
@@ -19,6 +20,7 @@ _SHARED = 0.5  # of the shorter recording's frames
 _MOST_COPIES = 64  # of one frame that are compared
 _NECK = 4
 _MISSING = -(2**40)
+_NUMBERS = re.compile(r"\d[\d.]*(?:(?:, |-)\d[\d.]*)*(?: and \d+ more places)?")
 
 
 class Duplicate(NamedTuple):
@@ -129,19 +131,54 @@ def persons_of(recordings: Iterable[Recording]) -> list[str]:
 def same_names(recordings: Iterable[Recording]) -> list[str]:
     """Return notes on names that files in several folders give: each folder's person counts apart.
 
-    Files that state their source are passed over, since it tells what they belong to.
+    Files that state their source are passed over, since it tells what they belong to. Names that differ in
+    case alone are told too.
     """
     ids: dict[str, set[str]] = {}
+    spellings: dict[str, set[str]] = {}
     for recording in recordings:
+        if not recording.companion:
+            spellings.setdefault(recording.person_id.casefold(), set()).add(recording.person_id)
         if recording.person and not recording.source and not recording.companion:
             ids.setdefault(recording.person, set()).add(recording.person_id)
-    return [
+    notes = [
+        f"{', '.join(sorted(found))} count as {len(found)} persons, since their names differ in case; if "
+        "they are one person, who may then be in training and test, spell the name in one way"
+        for found in spellings.values()
+        if len(found) > 1
+    ]
+    return notes + [
         f"{', '.join(sorted(found))} count as {len(found)} persons, since no file states a source; if "
         f"they are one person, {name} may be in training and test: put the files into one folder, or "
         "give them the same source"
         for name, found in ids.items()
         if len(found) > 1
     ]
+
+
+def notes_of_reading(recordings: Iterable[Recording]) -> list[str]:
+    """Return what reading noted on single recordings, alike notes once, with how many recordings have them.
+
+    Pieces of one recording count as one.
+    """
+    whole = {(r.path or id(r), r.companion): r for r in recordings}
+    alike: dict[str, list[str]] = {}
+    for note in (note for r in whole.values() for note in r.notes):
+        alike.setdefault(_NUMBERS.sub("#", note), []).append(note)
+    first = ", numbers of the first"
+    return [
+        f"{same[0]} ({counted(len(same), 'recording')}{first * (len(set(same)) > 1)})"
+        for same in sorted(alike.values(), key=len, reverse=True)
+    ]
+
+
+def refuse_both_sides(fitted: set[str], held_out: set[str]) -> None:
+    """Raise `OverlapError` if a person is to be fitted to and held out."""
+    both = sorted(fitted & held_out)
+    if both:
+        raise OverlapError(
+            f"{', '.join(both)}: held out, but to be fitted to as well; name each person on one side"
+        )
 
 
 def unstated_rates(recordings: Iterable[Recording]) -> list[str]:

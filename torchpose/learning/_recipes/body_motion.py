@@ -31,7 +31,7 @@ from torchpose.learning._recipes.choosing import (
     recorded_joints,
     state_of,
 )
-from torchpose.learning._recipes.gaps import notes_on_gaps, whole_pieces
+from torchpose.learning._recipes.gaps import notes_on_motion, whole_pieces
 from torchpose.math._rotations import matrix_to_quaternion_vector
 from torchpose.priors._body_motion import BodyMotion, BodyMotionInfo
 from torchpose.skeleton._joint_sets import canonical_names
@@ -104,7 +104,7 @@ class RecordedMotion:
                     _set_of(recording),
                 )
             )  # fmt: skip
-        notes = (*notes_on_gaps(both), *left_out, *more)
+        notes = (*notes_on_motion(both), *left_out, *more)
         return cls(fps, found[:n], found[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:

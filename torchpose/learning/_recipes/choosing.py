@@ -19,7 +19,11 @@ from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._mocap import resample_frames
 from torchpose.io._recordings import Recording, find_recordings, read_recordings
-from torchpose.learning._curation.splits import pick_persons, refuse_shared_recordings
+from torchpose.learning._curation.splits import (
+    pick_persons,
+    refuse_both_sides,
+    refuse_shared_recordings,
+)
 from torchpose.learning._recipes.gaps import LONGEST_GAP, fill_short_gaps, missing_joints
 
 
@@ -53,17 +57,21 @@ def choose_recordings(
 
     Raises:
         InputError: unknown persons, actions or files, or nobody left to learn from. OverlapError: a
-            recording that is on both sides, under another person.
+            person on both sides, or a recording, under another person.
     """
     files = find_recordings([expand_path(path) for path in paths])
     unknown = sorted(set(without or ()) - {file.stem for file in files})
     if unknown:
         raise InputError(f"without: no file named {', '.join(unknown)} among the recordings")
-    recordings = read_recordings([f for f in files if f.stem not in (without or ())], axes)
+    left = [file for file in files if file.stem not in (without or ())]
+    if not left:
+        raise InputError("without: names all of the recordings; name fewer")
+    recordings = read_recordings(left, axes)
     recordings = [r for r in recordings if not r.companion]
     known = sorted({r.person_id for r in recordings})
     out = pick_persons(held_out or (), known)
-    wanted = (set(known) if persons is None else pick_persons(persons, known)) - out
+    wanted = set(known) - out if persons is None else pick_persons(persons, known)
+    refuse_both_sides(wanted, out)
     if actions is not None:
         done = sorted({r.action for r in recordings})
         missing = [action for action in actions if action not in done]
@@ -77,6 +85,10 @@ def choose_recordings(
     if not found.train:
         raise InputError(
             "everybody is held out, or did none of the actions; nobody is left to learn from"
+        )
+    if out and not found.watched:
+        raise InputError(
+            f"none of the persons held out ({', '.join(sorted(out))}) did any of the actions; hold others out"
         )
     refuse_shared_recordings(found.train, found.watched)
     return found

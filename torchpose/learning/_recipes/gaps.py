@@ -11,6 +11,7 @@ from torchpose._core.wording import counted, first_of
 from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
+from torchpose.learning._curation.splits import notes_of_reading, same_names
 from torchpose.math._hermite import hermite
 
 LONGEST_GAP = 0.2
@@ -77,6 +78,11 @@ def whole_pieces(recordings: Sequence[Recording]) -> tuple[list[Recording], tupl
             f"or beside gaps of more than {LONGEST_GAP:g} s"
         )
     return pieces, tuple(notes)
+
+
+def notes_on_motion(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Return notes on persons of like names, on what reading assumed, and on joints that are interpolated."""
+    return (*same_names(recordings), *notes_of_reading(recordings), *notes_on_gaps(recordings))
 
 
 def notes_on_gaps(recordings: Sequence[Recording]) -> tuple[str, ...]:

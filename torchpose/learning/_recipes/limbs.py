@@ -31,7 +31,7 @@ from torchpose.learning._recipes.choosing import (
     recorded_joints,
     state_of,
 )
-from torchpose.learning._recipes.gaps import notes_on_gaps, whole_pieces
+from torchpose.learning._recipes.gaps import notes_on_motion, whole_pieces
 from torchpose.math._rotations import compose, conjugate
 from torchpose.priors._limb_conditionals import LimbConditionals
 
@@ -92,7 +92,7 @@ class LimbStates:
         centred = {person: body.altered(centres=centres) for person, body in bodies.items()}
         # fitted again, since the twist that joints do not tell is zero about the centres
         states = [state_of(centred[r.person_id], r, j) for r, j in zip(both, joints, strict=True)]
-        notes = (*notes_on_gaps(both), *left_out, *more)
+        notes = (*notes_on_motion(both), *left_out, *more)
         return cls(centred[first], fps, states[:n], states[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:

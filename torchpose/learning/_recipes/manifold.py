@@ -9,6 +9,7 @@ import os
 import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Self
 
@@ -247,7 +248,11 @@ def run_to_end(
             if kept is not None:
                 with atomic_path(kept) as temporary:
                     kept_fit = {"of": _same_for(fitting), "fit": fitting.state_dict()}
-                    torch.save(kept_fit, temporary)
+                    buffer = (
+                        BytesIO()
+                    )  # torch.save says of a full disk only that it is at a wrong place
+                    torch.save(kept_fit, buffer)
+                    temporary.write_bytes(buffer.getvalue())
             bar.set_postfix_str(f"held-out error {found['held_out']:.5f}", refresh=False)
             bar.update()
     return fitting
