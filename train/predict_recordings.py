@@ -8,8 +8,9 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from torchpose._core.digests import digest_of_files
-from torchpose.errors import InputError
+from torchpose.errors import InputError, TorchposeError
 from torchpose.io._formats.keypoint_files import is_keypoint_header
+from torchpose.io._formats.openpose import holds_openpose, openpose_files
 from torchpose.io._formats.table_rows import split_row
 from train.predict_summary import COLUMNS
 
@@ -18,7 +19,7 @@ __all__ = ["Found", "KeypointRecording", "content_of", "find_keypoints", "share"
 _SUFFIXES = (".npz", ".csv")
 _POINTS = ("keypoints.npy", "joints2d.npy")
 _RESULTS = ({"joints3d.npy", "covariance3d.npy"}, {"state.npy", "body_frame.npy"})
-_OPENPOSE = "*_keypoints.json"
+_OPENPOSE = "OpenPose's JSON files"
 _FIRST = "frame"  # column of a table
 _LONGEST = 60  # characters of what a file holds
 
@@ -97,7 +98,7 @@ def content_of(path: Path) -> str:
     """Return SHA-256 of a file, or of the names and contents of the files in a folder of OpenPose's."""
     if not path.is_dir():
         return digest_of_files([path])
-    files = sorted(path.glob(_OPENPOSE))
+    files = openpose_files(path)
     named = ((f"{file.name}\0{file.stat().st_size}\0", file) for file in files)
     return digest_of_files(part for pair in named for part in pair)
 
@@ -130,7 +131,10 @@ def _candidates_in(given: Path, leave_out: Path | None) -> Iterable[tuple[str, P
 
 
 def _is_openpose(folder: Path) -> bool:
-    return next(folder.glob(_OPENPOSE), None) is not None
+    try:
+        return holds_openpose(folder)
+    except TorchposeError:
+        return True  # reading it gives the error
 
 
 def _holds(path: Path) -> tuple[str, ...]:
@@ -165,7 +169,7 @@ def _fault(path: Path, holds: tuple[str, ...]) -> str:
 def _length(path: Path) -> int:
     """Return the number of frames, or about that; 0 if it cannot be told."""
     if path.is_dir():
-        return sum(1 for _ in path.glob(_OPENPOSE))
+        return len(openpose_files(path))
     try:
         if path.suffix.lower() != ".npz":
             with path.open("rb") as stream:

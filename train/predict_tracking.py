@@ -60,8 +60,12 @@ class BatchTracker:
         """Return what is the same for every recording: digests of prior and settings, the version."""
         tracker = self._tracker
         settings = {k: v for k, v in asdict(tracker.settings).items() if k != "prior"}
-        if tracker.camera_file:
-            settings["camera"] = content_of(tracker.camera_file)
+        files = {
+            "camera": tracker.camera_file,
+            "arms": settings["arms"],
+            "person": settings["person"],
+        }
+        settings |= {key: content_of(Path(file)) for key, file in files.items() if file}
         return {
             "format": str(_FORMAT),
             "torchpose": torchpose.__version__,

@@ -1,5 +1,6 @@
 """Batch tracking: the same poses as `torchpose track`, shared, resumed, nothing twice or lost."""
 
+import copy
 import csv
 import json
 import os
@@ -8,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,13 @@ from torchpose.cli._track import command as track_command
 from torchpose.cli._track import main as track
 from torchpose.errors import InputError, OutputError, PriorError
 from torchpose.learning import fit_upper_body_prior
+from torchpose.priors._arms import shipped_arm_prior
 from torchpose.upper_body import PoseTrack
 from torchpose.upper_body._keypoint_files import TrackSettings
 from train import predict as module
 from train.predict import build, main, predict, process_rank
 from train.predict_claims import Claims
-from train.predict_recordings import find_keypoints, share
+from train.predict_recordings import content_of, find_keypoints, share
 from train.predict_summary import COLUMNS
 from train.predict_tracking import BatchTracker, read_origin
 
@@ -273,6 +275,32 @@ def test_openpose_folders_csv_and_names_that_clash(tmp_path) -> None:
         InputError, match=r"clips: is the folder of the results.*choose another --out"
     ):
         find_keypoints([tmp_path / "clips"], leave_out=tmp_path / "clips")
+
+
+def test_folders_of_other_programs_are_recordings(tmp_path) -> None:
+    """As `torchpose track` takes them: they were passed over without a word."""
+    for name, text in {"cam/c.0007": '{"people": []}', "azure/a1": '{"bone_list": []}'}.items():
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / f"{name}.json").write_text(text)
+    [found] = find_keypoints([tmp_path]).recordings
+    assert (found.name, found.n_frames) == ("cam", 1)
+    before = content_of(found.path)
+    (tmp_path / "cam" / "c.0008.json").write_text('{"people": []}')
+    assert content_of(found.path) != before
+    assert find_keypoints([tmp_path / "cam"]).recordings == [found._replace(n_frames=2)]
+
+
+def test_what_files_of_settings_hold_is_part_of_the_task(prior_file, tmp_path) -> None:
+    file, tasks = tmp_path / "arms.safetensors", []
+    for name in ("one", "two"):
+        arms = copy.copy(shipped_arm_prior())
+        arms.info = replace(arms.info, name=name)
+        arms.save(file)
+        settings = TrackSettings(prior=prior_file, method="articulated", arms=str(file))
+        tasks.append(BatchTracker(settings).task)
+    moved = file.rename(tmp_path / "moved.safetensors")
+    tasks.append(BatchTracker(replace(settings, arms=str(moved))).task)
+    assert tasks[0] != tasks[1] == tasks[2]
 
 
 def test_results_inside_the_recordings_are_no_recordings(data, prior_file) -> None:

@@ -123,7 +123,7 @@ def read_openpose_people(folder: str | Path) -> OpenPosePeople:
 
 def holds_openpose(folder: Path) -> bool:
     """Return whether a folder holds OpenPose's files, and not those of Azure Kinect, by names and people."""
-    files = _files_of(folder)
+    files = openpose_files(folder)
     if not files or files[0].name.endswith(_SUFFIX):
         return bool(files)
     with reading(files[0], _EXPECTED), files[0].open("rb") as stream:
@@ -179,7 +179,7 @@ def _measured(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _files_by_frame(folder: Path) -> dict[int, Path]:
     with reading(folder, "a folder"):
-        files = _files_of(folder)
+        files = openpose_files(folder)
     if not files:
         if not any(folder.iterdir()):
             raise NobodySeenError(
@@ -199,7 +199,7 @@ def _files_by_frame(folder: Path) -> dict[int, Path]:
     return dict(zip(numbers, files, strict=True))
 
 
-def _files_of(folder: Path) -> list[Path]:
+def openpose_files(folder: Path) -> list[Path]:
     """Return the files of frames: those with OpenPose's names, else those with a number at the end."""
     files = sorted(folder.glob(f"*{_SUFFIX}"))
     return files or [path for path in sorted(folder.glob("*.json")) if path.stem[-1:].isdecimal()]
