@@ -184,7 +184,11 @@ class PriorWriter(Callback):
             self._open.enter_context(self.results)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write everything, from the first process."""
+        """Write everything, from the first process; a trial of one step is no prior, and writes nothing."""
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            if trainer.is_global_zero:
+                print(f"a trial (fast_dev_run): {self.out} is not written", flush=True)
+            return
         finish = getattr(pl_module, "finished_prior", None)
         prior = finish(**self._facts) if finish else None
         if prior is None:

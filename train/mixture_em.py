@@ -53,7 +53,7 @@ class MixtureEM(LightningModule):
         self.held_out_history: dict[str, list[float]] = {}
         self._tasks: dict[str, MixtureTask] = {}
         self._identity: dict[str, Any] = {}
-        self._whole: dict[str, tuple[int, GaussianMixture]] = {}  # and the steps that it had taken
+        self._whole: dict[str, tuple[int, GaussianMixture]] = {}  # and the length of its history
         self._resumed, self._stopped = False, False
 
     # --- what Lightning calls
@@ -143,9 +143,9 @@ class MixtureEM(LightningModule):
     def assembled(self, **facts: str) -> UpperBodyPrior:
         """Return the prior of the mixtures as they are, not calibrated; facts are name, licence, command."""
         for name, task in self._tasks.items():
-            steps = int(self.em(name).steps)
-            if self._whole.get(name, (-1, None))[0] != steps:
-                self._whole[name] = steps, task.whole(self.em(name).mixture().cpu())
+            length = len(self.em(name).history)
+            if self._whole.get(name, (-1, None))[0] != length:
+                self._whole[name] = length, task.whole(self.em(name).mixture().cpu())
         whole = {name: mixture for name, (_, mixture) in self._whole.items()}
         return self._data.recipe.assemble(self._data.train, whole, **facts)
 

@@ -30,7 +30,7 @@ def recordings(tmp_path_factory):
 def fitted(recordings, tmp_path_factory):
     """Folder of a fit without windows, calibrated."""
     folder = tmp_path_factory.mktemp("fit")
-    values = settings(recordings, folder) | {"pictures": {"every": 3, "n_shown": 2}}
+    values = settings(recordings, folder) | {"pictures": {"every": 5, "n_shown": 2}}
     assert main(["fit", "--config", str(write_settings(folder, values))]) == 0
     return folder
 
@@ -104,7 +104,7 @@ def test_files_and_logs(fitted):
     events = EventAccumulator(str(log)).Reload()
     assert {"log_likelihood/pose", "held_out/pose"} <= set(events.Tags()["scalars"])
     assert {"components-pose", "likelihood", "samples"} == set(events.Tags()["images"])
-    assert [image.step for image in events.Images("likelihood")] == [3, 6]
+    assert [image.step for image in events.Images("likelihood")] == [5, 6]
 
 
 def test_again_from_its_own_configuration_gives_the_same_bytes(fitted, tmp_path):
@@ -123,6 +123,14 @@ def test_resumed_after_the_last_step_gives_the_same_bytes(fitted, tmp_path):
     assert main([*line, "--trainer.default_root_dir", str(tmp_path / "runs")]) == 0
     assert (tmp_path / "p.safetensors").read_bytes() == (fitted / "p.safetensors").read_bytes()
     assert not (tmp_path / "runs" / "version_1" / "metrics.csv").exists()
+
+
+def test_a_trial_of_one_step_replaces_no_prior(fitted, tmp_path, capsys):
+    before = (fitted / "p.safetensors").read_bytes()
+    line = ["fit", "--config", str(fitted / "fit.yaml"), "--trainer.fast_dev_run", "true"]
+    assert main([*line, "--trainer.default_root_dir", str(tmp_path)]) == 0
+    assert f"{fitted / 'p.safetensors'} is not written" in capsys.readouterr().out
+    assert (fitted / "p.safetensors").read_bytes() == before
 
 
 OTHER = {
