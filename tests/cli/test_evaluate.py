@@ -57,6 +57,10 @@ def test_options_reach_the_protocol(torchpose, calls, tmp_path):
     done = torchpose("evaluate", *line, "learning-curve", "--methods", '["b", "c"]')
     assert done.code == 0, done.err
     assert tuple(calls[-1]["methods"]) == ("b", "c")
+    for given in (["b"], ["b,c"], ["b", "c"]):
+        done = torchpose("evaluate", "learning-curve", tmp_path, "--methods", *given, *line[2:])
+        assert done.code == 0, done.err
+        assert ",".join(calls[-1]["methods"]) == ",".join(given)
 
 
 def test_help_comes_from_the_docstring(torchpose, calls):

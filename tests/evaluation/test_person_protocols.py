@@ -307,6 +307,20 @@ def test_recipes_by_name(data, tmp_path):
         learning_curve.run(data, tmp_path, progress=False, counts=(1, 9))
 
 
+def test_data_that_would_not_be_used_are_refused(data, tmp_path):
+    more = (str(data / "burke_kinect"),)
+    others = shutil.copytree(data / "kinect_utd_mhad", tmp_path / "others")
+    with pytest.raises(
+        InputError, match=r"counts beyond the 3 who .* got counts of 1, 2, 3; give larger"
+    ):
+        learning_curve.run([others], tmp_path, progress=False, more=more)
+    for folders, part in (([others, more[0]], "cross"), ([data], "both")):
+        with pytest.raises(InputError, match="added: motion capture is for the second part"):
+            cross_dataset.run(folders, tmp_path, progress=False, part=part, added=more)
+    with pytest.raises(InputError, match="mocap_share must be positive"):
+        cross_dataset.run([data], tmp_path, progress=False, mocap_share=-1.0)
+
+
 @pytest.mark.slow
 def test_across_data_sets(data, tmp_path):
     report = cross_dataset.run(data, tmp_path, progress=False, part="cross", recipe=recipe)

@@ -138,34 +138,13 @@ class Command(NamedTuple):
             ArgumentError: arguments that it does not take.
         """
         parser = self.parser()
-        values = vars(parser.parse_args(self._with_lists(arguments)))
+        by_place = sum(option.positional for option in self.own)
+        values = vars(parser.parse_args(with_lists(arguments, self.options, by_place)))
         for option in self.own:  # what may be left out is not read from a configuration by itself
             if option.positional and values[option.key] is None and values["config"]:
                 values[option.key] = parser.parse_path(values["config"][-1])[option.key]
         words = tuple(self.name.split())
         return Given(words, values, vars(parser.get_defaults()), tuple(arguments))
-
-    def _with_lists(self, arguments: Sequence[str]) -> list[str]:
-        """Return arguments in which lists that are separated by commas or blanks are one word, as [a,b].
-
-        Blanks separate a list only where everything that is given by its place stands before all options:
-        another word behind an option can then be nothing else.
-        """
-        lists = {option.flag for option in self.options if option.is_list and not option.spaced}
-        by_place = sum(option.positional for option in self.own)
-        leading = next((i for i, word in enumerate(arguments) if word.startswith("--")), 0)
-        words: list[str] = []
-        rest = list(arguments)
-        while rest:
-            words.append(rest.pop(0))
-            if words[-1] not in lists or not rest or rest[0].startswith("--"):
-                continue
-            items = [rest.pop(0)]
-            while leading >= by_place and rest and not rest[0].startswith("--"):
-                items.append(rest.pop(0))
-            one = len(items) == 1 and ("[" in items[0] or "," not in items[0])
-            words.append(items[0] if one else f"[{','.join(i.strip('[], ') for i in items)}]")
-        return words
 
     def main(self, arguments: Sequence[str]) -> int:
         """Run the command and return its exit code."""
@@ -179,6 +158,34 @@ class Command(NamedTuple):
         if "given" in self.run.__annotations__:
             values["given"] = given
         return self.run(**values)
+
+
+def with_lists(
+    arguments: Sequence[str], options: Iterable[Option], by_place: int, alone: bool = False
+) -> list[str]:
+    """Return arguments in which lists that are separated by commas or blanks are one word, as [a,b].
+
+    Blanks separate a list only where everything that is given by its place stands before all options:
+    another word behind an option can then be nothing else.
+
+    Args:
+        arguments: of a command. options: of it. by_place: how many words are given by their place, at least.
+        alone: make a list of a single word, too, where no option takes one item by itself.
+    """
+    lists = {option.flag for option in options if option.is_list and not option.spaced}
+    leading = next((i for i, word in enumerate(arguments) if word.startswith("--")), 0)
+    words: list[str] = []
+    rest = list(arguments)
+    while rest:
+        words.append(rest.pop(0))
+        if words[-1] not in lists or not rest or rest[0].startswith("--"):
+            continue
+        items = [rest.pop(0)]
+        while leading >= by_place and rest and not rest[0].startswith("--"):
+            items.append(rest.pop(0))
+        one = len(items) == 1 and ("[" in items[0] or not (alone or "," in items[0]))
+        words.append(items[0] if one else f"[{','.join(i.strip('[], ') for i in items)}]")
+    return words
 
 
 def new_parser(

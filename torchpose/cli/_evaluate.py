@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 from jsonargparse import ArgumentParser, Namespace
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli._command import add_options, new_parser
+from torchpose.cli._command import add_options, new_parser, with_lists
 from torchpose.cli._options import REQUIRED, Option, documented, options_of
 from torchpose.errors import InputError
 
@@ -98,9 +98,10 @@ def main(arguments: list[str]) -> int:
         if {"-h", "--help"} & {*arguments}:
             _overview().parse_args(arguments)  # prints the help and ends
         raise ArgumentError(None, f"the protocol is missing; known are {', '.join(PROTOCOLS)}")
-    rest = list(arguments)
+    rest, protocol = list(arguments), PROTOCOLS[name]
     rest.remove(name)
-    return execute(PROTOCOLS[name], build(f"evaluate {name}", PROTOCOLS[name]).parse_args(rest))
+    words = with_lists(rest, protocol.options, by_place=1, alone=True)
+    return execute(protocol, build(f"evaluate {name}", protocol).parse_args(words))
 
 
 def _overview() -> ArgumentParser:

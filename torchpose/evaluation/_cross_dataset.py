@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose._core.checks import check_count
+from torchpose._core.checks import check_count, check_positive
 from torchpose._core.files import check_output_folder
+from torchpose._core.wording import counted
 from torchpose.errors import InputError
 from torchpose.evaluation._completion import (
     Completion,
@@ -143,7 +144,13 @@ def run(
     check_count("workers", workers)
     if part not in ("both", "cross", "added"):
         raise InputError(f"part must be cross, added or both, got {part!r}")
+    check_positive("mocap_share", mocap_share)
     folders = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
+    if added and (part == "cross" or len(folders) == 1):
+        raise InputError(
+            "added: motion capture is for the second part (added or both) on two folders or more, got part "
+            f"{part} and {counted(len(folders), 'folder')}; leave --added out"
+        )
     if len(folders) > 1 and not added:
         if part == "added":
             raise InputError("expected folders of motion capture with --added, got none")

@@ -201,6 +201,12 @@ def _read(
     if len(persons) < 2:
         raise InputError(f"a learning curve needs two persons or more, got {', '.join(persons)}")
     counts = counts or usual or _doubling(len(persons) - 1)
+    if more and max(counts) < len(persons):
+        raise InputError(
+            f"more: further training persons are for counts beyond the {len(persons) - 1} who are there "
+            f"beside the one who is tracked, got counts of {', '.join(map(str, counts))}; give larger ones "
+            "(--counts), or leave --more out"
+        )
     if quick:
         persons = {name: group[::5] for name, group in persons.items()}
         counts = tuple(c for c in counts if c in counts[:2])
