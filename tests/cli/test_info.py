@@ -69,6 +69,19 @@ def test_recordings_and_cameras(torchpose, files, tmp_path):
     assert done.out == "door  f = (600, 610), centre (330, 250) pixels\n"
 
 
+def test_recordings_tell_their_rates_and_what_was_assumed(torchpose, files, tmp_path):
+    """Two rates were unknown ones, and nothing said that millimetres were guessed."""
+    for name, fps, unit in (("p1", 30.0, 1), ("p2", 15.0, 1000)):
+        with np.load(files / "recordings" / f"{name}.npz") as archive:
+            joints = unit * archive["joints"]
+            np.savez(tmp_path / f"{name}.npz", **{**archive, "fps": fps, "joints": joints})
+    (tmp_path / "p3.csv").write_text("nothing")
+    done = torchpose("info", tmp_path)
+    assert "900 (45.0 s at 15 to 30 fps)" in done.out
+    assert "taken for millimetres" in done.out and "(1 recording)" in done.out
+    assert f"not read, since the folder holds recordings as .npz: {tmp_path}/p3.csv" in done.out
+
+
 def test_a_table_as_wide_as_those_of_a_kinect(torchpose, tmp_path):
     """MediaPipe's 33 landmarks with visibilities have as many columns as 25 joints with states."""
     head = ["frame", *(f"{name}_{kind}" for name in LANDMARKS for kind in ("x", "y", "visibility"))]

@@ -240,19 +240,32 @@ def describe_keypoints(keypoints: "Keypoints") -> str:
 
 
 def _describe_recordings(path: Path) -> str:
-    from torchpose.io._recordings import read_recordings
+    from torchpose.io._recordings import (
+        find_recordings,
+        notes_on_unread_files,
+        read_recordings,
+    )
+    from torchpose.learning._curation.curate import notes_on_recordings
 
-    recordings = read_recordings(path)
+    found = find_recordings(path)
+    recordings = read_recordings(found)
     frames = sum(len(r) for r in recordings)
     rates = {r.fps for r in recordings}
+    length = _length(frames, rates.pop() if len(rates) == 1 else None)
+    if len(rates) > 1 and None not in rates:
+        seconds = sum(len(r) / r.fps for r in recordings if r.fps)
+        low, high = min(filter(None, rates)), max(filter(None, rates))
+        length = f"{frames} ({seconds:.1f} s at {low:.4g} to {high:.4g} fps)"
     necks = {str(r.upper_body().neck) for r in recordings}
+    notes = [*notes_on_recordings(recordings), *notes_on_unread_files(path, found)]
     return _table(
         {
             "recordings": f"{len(recordings)} in {path}",
-            "frames": _length(frames, rates.pop() if len(rates) == 1 else None),
+            "frames": length,
             "persons": ", ".join(sorted({r.person_id for r in recordings})),
             "joint sets": ", ".join(sorted({r.skeleton or "other" for r in recordings})),
             "necks": ", ".join(sorted(necks)),
+            "notes": "\n".join(notes),
         }
     )
 

@@ -138,6 +138,7 @@ def describe_body_motion(path: Path) -> Facts:
         "held out": _moved(info.extra),
         "actions": first_of(info.actions, _LISTED),
         **_origin(info),
+        "track with": "torchpose track-body --motion NAME|FILE",
     }
 
 
