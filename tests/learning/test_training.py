@@ -1,6 +1,7 @@
 """Training states: which frames are used, how often, from where, with which neck."""
 
 import math
+import re
 from collections import namedtuple
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from tests.priors.poses import lowered_neck, poses, recording
 from torchpose.camera import ViewRange, lift
 from torchpose.demo import performer
 from torchpose.errors import InputError, PriorError
-from torchpose.learning import TRAINING_VIEWS
+from torchpose.learning import TRAINING_VIEWS, fit_upper_body_prior
 from torchpose.learning._recipes import UpperBodyRecipe, calibration
 from torchpose.learning._recipes.calibration import MODES, _noisy_keypoints, track_held_out
 from torchpose.learning._samplers import all_samples
@@ -82,6 +83,27 @@ def test_frames_with_missing_joints_are_left_out_and_counted():
     joints[:, 3] = torch.nan
     with pytest.raises(InputError, match="left arm"):
         states(recording(joints))
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, None])
+def test_other_seeds_are_refused(seed):
+    with pytest.raises(InputError, match="seed must be a whole number from 0 on"):
+        fit_upper_body_prior([recording(poses(10))], 2, seed, n_samples=20)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("mirror_share", 2.0, "mirror_share must lie in 0..1, got 2"),
+        ("body_size", -0.3, "body_size must lie in 0..0.9"),
+        ("bone_lengths", 1.0, "bone_lengths must lie in 0..0.9"),
+        ("pose_tol", float("nan"), "pose_tol must be finite"),
+    ],
+)
+def test_settings_out_of_range_are_refused(name, value, said):
+    """They gave priors of bodies inside out, and of windows that all are mirrored."""
+    with pytest.raises(InputError, match=re.escape(said)):
+        UpperBodyRecipe(**{name: value})
 
 
 def test_facts_name_persons_sources_and_frame_rate():

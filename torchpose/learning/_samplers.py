@@ -7,6 +7,7 @@ blocks see the same states as one process that takes all of them, without paddin
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -68,7 +69,13 @@ def all_samples(source: SampleSource) -> Samples:
 
 
 def derived_seed(seed: int, purpose: str) -> int:
-    """Return a seed for one purpose, so that random numbers of different purposes are independent."""
+    """Return a seed for one purpose, so that random numbers of different purposes are independent.
+
+    Raises:
+        InputError: a seed that is no whole number from 0 on.
+    """
+    if not (isinstance(seed, Integral) and seed >= 0):
+        raise InputError(f"seed must be a whole number from 0 on, got {seed!r}")
     words = np.random.SeedSequence([seed, *purpose.encode()]).generate_state(1, np.uint64)
     return int(words[0]) >> 1
 

@@ -5,6 +5,7 @@
 `assemble` builds a prior of them, and `calibrate` measures it on held-out persons.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Unpack
@@ -130,6 +131,11 @@ class UpperBodyRecipe:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} must not be negative, got {value}")
+        for name, most in (("body_size", 0.9), ("bone_lengths", 0.9), ("mirror_share", 1.0)):
+            if not 0 <= getattr(self, name) <= most:
+                raise InputError(f"{name} must lie in 0..{most:g}, got {getattr(self, name):g}")
+        if not 0 <= self.pose_tol < math.inf:
+            raise InputError(f"pose_tol must be finite and not negative, got {self.pose_tol:g}")
 
     @property
     def layouts(self) -> dict[str, WindowLayout]:
