@@ -228,7 +228,7 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
 
     Args:
         recordings: all of them.
-        test_persons: ids (`Recording.person_id`).
+        test_persons: ids (`Recording.person_id`), or what stands on one side of their ``#``.
 
     Returns:
         `PersonSplit` with the recordings to train on and to test on.
@@ -237,7 +237,7 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
         InputError: a person without a recording, or nobody left on one side. OverlapError: one
             recording, or part of it, on both sides under different persons.
     """
-    split = _split(recordings, sorted(set(test_persons)))
+    split = _split(recordings, sorted(pick_persons(test_persons, persons_of(recordings))))
     refuse_leaks(split.train, split.test)
     apart = {*same_names(split.train), *same_names(split.test)}
     _warn([note for note in same_names([*split.train, *split.test]) if note not in apart])
@@ -245,18 +245,13 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
 
 
 def _split(recordings: Sequence[Recording], wanted: list[str]) -> PersonSplit:
-    known = persons_of(recordings)
-    strangers = [person for person in wanted if person not in known]
-    if strangers:
-        raise InputError(
-            f"no recording of {', '.join(strangers)}; there are recordings of {', '.join(known)}"
-        )
     test = [r for r in recordings if r.person_id in wanted]
     files = {r.path for r in test if r.path is not None}
     train = [r for r in recordings if r.person_id not in wanted and r.path not in files]
     if not test or not train:
         raise InputError(
-            f"a split needs persons on both sides, got {len(wanted)} to test of {len(known)} in all"
+            f"a split needs persons on both sides, got {len(wanted)} to test of "
+            f"{len(persons_of(recordings))} in all"
         )
     return PersonSplit(train, test, tuple(wanted))
 
