@@ -1,6 +1,7 @@
 """`torchpose fit manifold|limbs|actions|body`: files of the training loop, without Lightning; going on."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -352,6 +353,24 @@ def test_what_reading_assumed_is_told(kind, torchpose, walks, exercises, tmp_pat
     assert (
         f"note: not read, since the folder holds recordings as .npz: {folder}/more.csv" in done.out
     )
+
+
+def test_joints_that_are_never_there_are_told(torchpose, walks, tmp_path):
+    """A head that no recording has was held still without a word."""
+    for path in walks.iterdir():
+        with np.load(path) as values:
+            joints = values["joints"].copy()
+            if path.stem.startswith("p2"):
+                joints[:, BODY_15.joint("head")] = np.nan
+            np.savez(tmp_path / path.name, **{**values, "joints": joints})
+    line = ("fit", "limbs", tmp_path, "--out", tmp_path / "out" / "x.safetensors")
+    done = torchpose(*line)
+    assert done.code == 0, done.err
+    assert "note: head: never there in recordings of 240 of 720 frames" in done.out
+    shutil.copy(walks / "p2_1.npz", tmp_path / "p2_1.npz")
+    done = torchpose(*line)
+    assert done.code == 2
+    assert "p2_0.npz: head is never there, and other recordings of set#p2 have it" in done.err
 
 
 def test_a_full_disk_is_told(walks, tmp_path):

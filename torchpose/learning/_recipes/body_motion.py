@@ -104,7 +104,7 @@ class RecordedMotion:
                     _set_of(recording),
                 )
             )  # fmt: skip
-        notes = (*notes_on_motion(both), *left_out, *more)
+        notes = (*notes_on_motion(both, still=False), *left_out, *more)
         return cls(fps, found[:n], found[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:

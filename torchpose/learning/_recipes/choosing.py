@@ -138,6 +138,13 @@ def body_of_each(
     found = {}
     for person in dict.fromkeys(r.person_id for r in recordings):
         own = [j for r, j in zip(recordings, joints, strict=True) if r.person_id == person]
+        there = torch.stack([j.isfinite().all(-1).any(0) for j in own])
+        for which, joint in (there.any(0) & ~there).nonzero()[:1].tolist():
+            recording = [r for r in recordings if r.person_id == person][which]
+            raise InputError(
+                f"{recording.path or recording_name(recording)}: {BODY_15.names[joint]} is never there, and "
+                f"other recordings of {person} have it; leave the file out, or those others"
+            )
         try:
             found[person] = fit_body(torch.cat(own), frame=frame)
         except InputError as error:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.wording import counted, first_of
-from torchpose.body._skeleton import body_joints
+from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import notes_of_reading, same_names
@@ -80,9 +80,26 @@ def whole_pieces(recordings: Sequence[Recording]) -> tuple[list[Recording], tupl
     return pieces, tuple(notes)
 
 
-def notes_on_motion(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Return notes on persons of like names, on what reading assumed, and on joints that are interpolated."""
-    return (*same_names(recordings), *notes_of_reading(recordings), *notes_on_gaps(recordings))
+def notes_on_motion(recordings: Sequence[Recording], still: bool = True) -> tuple[str, ...]:
+    """Return notes on persons of like names, on what reading assumed, and on joints that are not recorded.
+
+    Args:
+        recordings: of whole bodies. still: whether joints that a recording never has count as still.
+    """
+    notes = [*same_names(recordings), *notes_of_reading(recordings), *notes_on_gaps(recordings)]
+    return (*notes, *(_notes_on_absent_joints(recordings) if still else ()))
+
+
+def _notes_on_absent_joints(recordings: Sequence[Recording]) -> list[str]:
+    absent = [
+        tuple(_body(r).isnan().any(-1).all(0).nonzero().flatten().tolist()) for r in recordings
+    ]
+    frames = sum(len(r) for r, joints in zip(recordings, absent, strict=True) if joints)
+    names = ", ".join(BODY_15.names[j] for j in sorted({j for joints in absent for j in joints}))
+    return [
+        f"{names}: never there in recordings of {frames} of {sum(map(len, recordings))} frames, and taken "
+        "for still, so the model holds it too still; leave these recordings out where others have it"
+    ] * bool(names)
 
 
 def notes_on_gaps(recordings: Sequence[Recording]) -> tuple[str, ...]:
