@@ -159,6 +159,9 @@ class PriorWriter(Callback):
         out: the prior, NAME.safetensors. name: in its metadata, that of the file by default.
         licence: of the recordings. command: that makes it. pictures: draw its mean poses.
 
+    Attributes:
+        ended: whether the fit came to its end.
+
     Raises:
         OutputError: a name that is none of a prior, a folder that cannot be written to.
     """
@@ -173,7 +176,7 @@ class PriorWriter(Callback):
     ) -> None:
         self.out = check_fit_file(out)
         self._facts = {"name": name or self.out.stem, "licence": licence, "command": command}
-        self._pictures = pictures
+        self._pictures, self.ended = pictures, False
         self._open = ExitStack()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -185,6 +188,7 @@ class PriorWriter(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write everything, from the first process; a trial of one step is no prior, and writes nothing."""
+        self.ended = True
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             if trainer.is_global_zero:
                 print(f"a trial (fast_dev_run): {self.out} is not written", flush=True)

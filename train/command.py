@@ -16,6 +16,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torchpose._core.files import check_output_folder
 from torchpose._core.terminal import show_progress, without_options
 from torchpose.errors import InputError
+from torchpose.learning._curation.curate import notes_on_recordings
 from torchpose.learning._selection import select_n_components
 from train.blocks import Key
 from train.callbacks import FitPictures, FitProgress, PriorWriter, StopAtOnce
@@ -172,11 +173,23 @@ class _Command(LightningCLI):
         """See that logs can be written, and read all recordings, before other processes are started."""
         folder = self.trainer.default_root_dir
         rank_zero_only(check_output_folder)(folder, "--trainer.default_root_dir")
-        self.datamodule.setup("fit")
-        report = getattr(self.datamodule, "report", None)
-        if report is not None:
-            unread = (f"note     {note}" for note in self.datamodule.unread)
-            rank_zero_only(print)(report.text(_SHOWN_DROPS), *unread, sep="\n", flush=True)
+        data = self.datamodule
+        data.setup("fit")
+        if not hasattr(data, "report"):
+            return
+        notes = data.unread if data.report else [*notes_on_recordings(data.train), *data.unread]
+        said = [data.report.text(_SHOWN_DROPS)] if data.report else []
+        for line in (*said, *(f"note     {note}" for note in notes)):
+            rank_zero_only(print)(line, flush=True)
+
+    def after_fit(self) -> None:
+        """Raise where the trainer took no step, which it calls done."""
+        callbacks = self.trainer.callbacks  # type: ignore[attr-defined]
+        if not any(c.ended for c in callbacks if isinstance(c, PriorWriter)):
+            raise InputError(
+                "the trainer took no step, so that nothing was written; leave out max_epochs, max_steps or "
+                "limit_train_batches of 0"
+            )
 
     def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
         given = super()._prepare_subcommand_kwargs(subcommand)

@@ -5,6 +5,7 @@ import errno
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -125,6 +126,16 @@ def test_resumed_after_the_last_step_gives_the_same_bytes(fitted, tmp_path):
     assert not (tmp_path / "runs" / "version_1" / "metrics.csv").exists()
 
 
+def test_notes_stay_without_curation(recordings, tmp_path, capsys):
+    with np.load(next(recordings.glob("*.npz"))) as archive:
+        np.savez(tmp_path / "a.npz", **{**archive, "joints": 1000 * archive["joints"]})
+    values = settings(tmp_path / "a.npz", tmp_path)
+    values["data"]["init_args"] |= {"curation": None, "held_out": None}
+    line = ["fit", "--config", str(write_settings(tmp_path, values)), "--trainer.max_epochs", "0"]
+    assert main(line) == 2
+    assert "note     taken for millimetres" in capsys.readouterr().out
+
+
 def test_a_trial_of_one_step_replaces_no_prior(fitted, tmp_path, capsys):
     before = (fitted / "p.safetensors").read_bytes()
     line = ["fit", "--config", str(fitted / "fit.yaml"), "--trainer.fast_dev_run", "true"]
@@ -202,6 +213,7 @@ REFUSED = {
         {}, ["--seed_everything", "1", "--data.recipe.seed", "2"],
         "seed_everything is 1, and data.init_args.recipe.seed is 2; leave one",
     ),
+    "no step": ({}, ["--trainer.max_epochs", "0"], "the trainer took no step, so that nothing was"),
     "logs": (
         {}, ["--trainer.default_root_dir", "{tmp}/fit.yaml"],
         "fit.yaml: results cannot be written to this folder (File exists); choose another with "
