@@ -288,6 +288,7 @@ def test_a_table_of_several_bodies(tmp_path):
     ("change", "word"),
     [
         (lambda t: t.replace("Head_x", "Head_w", 1), "joint Head has the columns y, z"),
+        (lambda t: t.replace("Head_", "Neck_"), "column neck_x is there twice"),
         (lambda t: t.replace("\n", ",1\n").replace(",1\n", "\n", 1), "line 2: expected 75 cells"),
         (lambda t: "# fps = fast\n" + t, "fps must be one positive"),
         (lambda t: t.replace("-0.", "-0:", 1), "line 2: expected numbers"),

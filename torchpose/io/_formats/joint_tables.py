@@ -157,6 +157,12 @@ def _table_of(path: Path, rows: list[tuple[int, str]]) -> _Table:
                 f"{path}: joint {joint} has the columns {', '.join(sorted(places))}; expected x, y, z"
             )
     header = [re.sub(r"\W+", "_", cell).strip("_").lower() for cell in split_row(rows[0][1])]
+    used = {header[column] for places in joints.values() for column in places.values()}
+    twice = sorted(name for name in used if header.count(name) > 1)
+    if twice:
+        raise FileFormatError(
+            f"{path}: column {twice[0]} is there twice; expected each joint once, so rename one or drop it"
+        )
     return _Table(path, header, joints, split_rows(path, rows[1:], len(header)))
 
 
