@@ -6,6 +6,7 @@ import torch
 from scipy.stats import multivariate_normal
 
 from tests.filters.oracles import random_covariance, tensor
+from torchpose.errors import InputError, ShapeError
 from torchpose.math import _gaussian as gaussian
 
 
@@ -190,3 +191,42 @@ def test_moments_of_a_mixture_are_those_of_its_draws(rng):
     draws = means[chosen] + (np.linalg.cholesky(covs)[chosen] @ noise)[..., 0]
     np.testing.assert_allclose(mean, draws.mean(0), atol=5 * draws.std() / n**0.5)
     np.testing.assert_allclose(cov, np.cov(draws.T), atol=0.1)
+
+
+PREDICTION = {"mean": (4,), "cov": (4, 4), "transition": (4, 4), "offset": (4,), "noise": (4, 4)}
+UPDATE = {"mean": (4,), "cov": (4, 4), "z": (2,), "measurement_cov": (2, 2)}
+
+
+@pytest.mark.parametrize(
+    ("step", "sizes", "wrong"),
+    [(gaussian.kalman_predict, PREDICTION, {name: (3, 3)}) for name in PREDICTION if name != "mean"]
+    + [(gaussian.kalman_predict, PREDICTION, {"mean": ()})]
+    + [(gaussian.kalman_update, UPDATE, {name: (3, 3)}) for name in UPDATE if name != "mean"]
+    + [
+        (gaussian.kalman_predict, PREDICTION, {"mean": (3, 4), "noise": (2, 4, 4)}),
+        (gaussian.kalman_update, UPDATE, {"mean": (3, 4), "cov": (2, 4, 4)}),
+    ],
+)
+def test_sizes_that_do_not_fit_are_named(step, sizes, wrong):
+    values = {name: torch.zeros(wrong.get(name, size)) for name, size in sizes.items()}
+    if step is gaussian.kalman_update:
+        values["observed"] = torch.tensor([2, 0])
+    with pytest.raises(ShapeError, match=f"{list(wrong)[-1]}"):
+        step(**values)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"observed": [2, 0]}, "observed must be a tensor, got list"),
+        ({"observed": torch.tensor([4, 0])}, r"observed must lie in 0..3, got \[4, 0\]"),
+        ({"observed": torch.tensor([True, False])}, "observed must hold indices"),
+        ({"mask": torch.ones(2)}, "mask must be bool, got torch.float32"),
+        ({"mask": torch.ones(3).bool()}, r"mask must have shape \[..., 2\], got \[3\]"),
+        ({"cov": np.eye(4)}, "cov must be a tensor, got ndarray"),
+    ],
+)
+def test_what_does_not_say_which_dimensions_are_measured_is_named(wrong, said):
+    values = {name: torch.zeros(size) for name, size in UPDATE.items()}
+    with pytest.raises((InputError, ShapeError), match=said):
+        gaussian.kalman_update(**(values | {"observed": torch.tensor([2, 0])} | wrong))

@@ -27,7 +27,7 @@ from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, uniform
 from torchpose.filters._resampling import ancestors, systematic, systematic_positions
 from torchpose.filters._weights import estimate_of, normalise
-from torchpose.math._gaussian import kalman_predict, mended_update
+from torchpose.math._gaussian import mended_update, predict_moments
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 
@@ -100,7 +100,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         drawn = self._draw_components(frame.z.shape[0], generator)
         matrix, offset, noise = (part[drawn] for part in self.transition(state.time))
         wide = torch.float64
-        mean, cov = kalman_predict(state.mean.to(wide), state.cov, matrix, offset, noise)
+        mean, cov = predict_moments(state.mean.to(wide), state.cov, matrix, offset, noise)
         noise_cov = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
         mask = frame.mask[:, None].expand(*mean.shape[:2], -1)
         mean, cov, log_likelihood, jitter = mended_update(

@@ -6,6 +6,7 @@ and what comes back is symmetric by construction.
 
 import math
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose._core.value_checks import values_visible
+from torchpose.errors import InputError, ShapeError
 
 LOG_2PI = math.log(2 * math.pi)
 _JITTER = (1e-14, 1e-12, 1e-10, 1e-8, 1e-6)
@@ -245,7 +248,41 @@ def kalman_predict(
 
     Returns:
         Mean [..., D] and covariance [..., D, D] of the prediction.
+
+    Raises:
+        ShapeError: sizes that do not fit together. InputError: no tensors.
     """
+    check_tensors(mean=mean, cov=cov, transition=transition, offset=offset, noise=noise)
+    check_shape("mean", mean, ["...", "D"])
+    square = (mean.shape[-1],) * 2
+    _check_sizes(
+        mean=(mean, square[:1]), cov=(cov, square), transition=(transition, square),
+        offset=(offset, square[:1]), noise=(noise, square),
+    )  # fmt: skip
+    return predict_moments(mean, cov, transition, offset, noise)
+
+
+def _check_sizes(**values: tuple[Tensor, tuple[int, ...]]) -> None:
+    """Raise `ShapeError` unless tensors end in the given sizes, and their batch dimensions broadcast."""
+    batches = {}
+    for name, (tensor, sizes) in values.items():
+        check_shape(name, tensor, ["...", *sizes])
+        batches[name] = tuple(tensor.shape[: tensor.ndim - len(sizes)])
+    for sizes in zip_longest(*(batch[::-1] for batch in batches.values()), fillvalue=1):
+        several = [size for size in sizes if size != 1]
+        if any(size != several[0] for size in several):
+            said = ", ".join(f"{list(batch)} of {name}" for name, batch in batches.items())
+            raise ShapeError(f"batch dimensions must broadcast, got {said}")
+
+
+def predict_moments(
+    mean: Float[Tensor, "... D"],
+    cov: Float[Tensor, "... D D"],
+    transition: Float[Tensor, "... D D"],
+    offset: Float[Tensor, "... D"],
+    noise: Float[Tensor, "... D D"],
+) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"]]:
+    """Return the result of `kalman_predict`, unchecked."""
     dim = cov.shape[-1]
     right = _multiply(cov, pad(transition, (0, 0, 0, spare_columns(dim))).mT)
     if right.shape[:-2] == mean.shape[:-1]:  # one product, F [P F^T, x]
@@ -385,9 +422,35 @@ def kalman_update(
     Returns:
         Mean [..., D], covariance [..., D, D] and log-likelihood log N(z | H x, H P H^T + R) [...] of what
         was measured.
+
+    Raises:
+        ShapeError: sizes that do not fit together. InputError: no tensors, no indices, or a mask that is
+            not bool.
     """
+    check_tensors(
+        mean=mean, cov=cov, z=z, measurement_cov=measurement_cov, observed=observed, mask=mask
+    )
+    check_shape("mean", mean, ["...", "D"])
+    check_shape("observed", observed, ["Z"])
+    dims, measured = mean.shape[-1:], observed.shape
+    given = {} if mask is None else {"mask": (mask, measured)}
+    _check_sizes(
+        mean=(mean, dims), cov=(cov, dims * 2), z=(z, measured),
+        measurement_cov=(measurement_cov, measured * 2), **given,
+    )  # fmt: skip
+    _check_kinds(observed, mask, dims[0])
     mean, cov, log_likelihood, _ = mended_update(mean, cov, z, measurement_cov, observed, mask)
     return mean, cov, log_likelihood
+
+
+def _check_kinds(observed: Tensor, mask: Tensor | None, dim: int) -> None:
+    """Raise `InputError` unless these are indices of dimensions, and truth values or None."""
+    if observed.dtype not in (torch.int64, torch.int32):
+        raise InputError(f"observed must hold indices, as torch.int64, got {observed.dtype}")
+    if mask is not None and mask.dtype != torch.bool:
+        raise InputError(f"mask must be bool, got {mask.dtype}; compare it, as in mask > 0")
+    if values_visible() and not all(0 <= index < dim for index in observed.tolist()):
+        raise InputError(f"observed must lie in 0..{dim - 1}, got {observed.tolist()}")
 
 
 def mended_update(
