@@ -203,6 +203,8 @@ def test_bad_input_is_refused():
         HaarFaceDetector(scale_factor=1.0)
     with pytest.raises(InputError, match="grey"):
         HaarFaceDetector()(np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(InputError, match="must be callable"):
+        FaceTracker("haar")
     tracker = FaceTracker(nobody)
     with pytest.raises(InputError):
         tracker.update(tracker.init(), torch.tensor([[1.0, float("nan"), 2.0]]))
@@ -368,3 +370,18 @@ def test_somebody_who_walks_away_from_another_is_still_used():
     assert size < 0.3 * 120
     used = state.mean[tracker.usable(state), 2]
     assert used.tolist() == pytest.approx([120.0, size], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (np.array([[30.0, 30.0, 60.0]]), "must be a floating-point tensor, got ndarray"),
+        ([], "must be a floating-point tensor, got list"),
+        (torch.ones(1, 3, dtype=torch.long), "got torch.int64"),
+        (torch.ones(1, 4), r"must have shape \[N, 3\], got \[1, 4\]"),
+    ],
+)
+def test_a_detector_of_ones_own_that_returns_no_faces_is_named(found, said):
+    tracker = FaceTracker(lambda image, region=None: found)
+    with pytest.raises((InputError, ShapeError), match="faces of the face detector.*" + said):
+        tracker.step(tracker.init(), np.zeros((120, 160), np.uint8))

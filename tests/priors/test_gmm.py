@@ -271,3 +271,10 @@ def test_rounded_mixtures_stay_positive_definite_and_change_no_more_than_roundin
         scale * scale[:, None] * mixture.covariances.diagonal(dim1=-2, dim2=-1).amax()
     )
     assert float(relative.max()) < 1e-4
+
+
+@pytest.mark.parametrize("shape", [5, 2.5, None, (2.5,), (-1,)])
+def test_a_shape_of_draws_that_is_none_is_named(shape):
+    mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
+    with pytest.raises(InputError, match=r"shape must be a sequence of sizes, such as \(5,\), got"):
+        mixture.sample(shape)

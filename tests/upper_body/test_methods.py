@@ -8,7 +8,7 @@ import torch
 
 from torchpose import load_prior
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-from torchpose.errors import InputError
+from torchpose.errors import InputError, SkeletonError
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import UpperBodyPrior
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
@@ -19,6 +19,7 @@ from torchpose.upper_body import (
     ProcessNoise,
     UpperBodyTracker,
     method_options,
+    pixel_indices,
     register_method,
 )
 from torchpose.upper_body._estimator import arm_joints
@@ -181,6 +182,12 @@ def test_an_option_changes_the_poses_or_is_refused(prior, keypoints, method, val
             change = joints(**(beside | {name: value})) - (joints(**beside) if beside else plain)
             assert change.abs().max() > 1e-9, name
     assert set(method_options(method)) <= set(values)
+
+
+def test_a_joint_that_no_arm_has_is_named():
+    assert pixel_indices(["elbow", "hand"]) == [3, 4, 0, 1]
+    with pytest.raises(SkeletonError, match=r"joints must be among hand, elbow, .*, got 'wrist'"):
+        pixel_indices(["hand", "wrist"])
 
 
 def test_editors_know_the_options_of_all_methods():

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_finite, check_floating, check_shape
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
@@ -70,7 +70,7 @@ class FaceTracker(nn.Module):
     pixels, as that of a face does which is lost while it moves away.
 
     Args:
-        detector: by default `HaarFaceDetector`.
+        detector: by default `HaarFaceDetector`; see `torchpose.measure.FaceDetector`.
         every: search for known faces in every n-th frame, in the region about them; while no track is
             used yet, in every frame.
         whole_every: search the whole image for new faces in every n-th frame. While faces of at most 40
@@ -86,7 +86,7 @@ class FaceTracker(nn.Module):
             found are those that are half as large again. 40 turns that off.
 
     Raises:
-        InputError: settings out of range.
+        InputError: settings out of range, or a detector that cannot be called.
 
     Reference:
         Burke & Lasenby, section 5.1.
@@ -127,6 +127,11 @@ class FaceTracker(nn.Module):
                 f"got {gate}, {std}, {acceleration}, {detail}, {smallest} and {damping}"
             )
         self.detector = HaarFaceDetector() if detector is None else detector
+        if not callable(self.detector):
+            raise InputError(
+                "a face detector must be callable, as torchpose.measure.FaceDetector, got "
+                f"{type(detector).__name__}"
+            )
         self.every, self.whole_every, self.search_every = every, whole_every, search_every
         self.gate, self.min_hits, self.memory = gate, min_hits, memory
         self.std, self.acceleration = std, acceleration
@@ -176,7 +181,8 @@ class FaceTracker(nn.Module):
             image: grey, [H, W], uint8, or a frame that is made grey where it is looked at.
 
         Raises:
-            InputError: another kind of image.
+            InputError: another kind of image, or a detector that returns no tensor. ShapeError: one that
+                returns a tensor of another shape than [N, 3].
         """
         predicted = self._predict(tracks)
         used = self.usable(tracks)
@@ -195,6 +201,13 @@ class FaceTracker(nn.Module):
             return predicted
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
+    def _detect(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
+        """Return what the detector finds, which may be anybody's, once it is seen to be faces."""
+        found = self.detector(image, region)
+        check_floating("faces of the face detector", found)
+        check_shape("faces of the face detector", found, ["N", 3])
+        return found
+
     def _look_everywhere(
         self, image: Image | GreyFrame, plain: bool, turn: float
     ) -> Float[Tensor, "N 3"]:
@@ -206,13 +219,13 @@ class FaceTracker(nn.Module):
         height, width = image.shape
         small = Region(0, 0, width, height, self.smallest, _USUAL)
         image = _seen_in(image, small)
-        found = self.detector(image)
+        found = self._detect(image)
         if plain or len(found):
             return found
-        found = _turned_search(self.detector, image, None, turn)
+        found = _turned_search(self._detect, image, None, turn)
         if len(found) or self.smallest >= _USUAL:
             return found
-        return self.detector(image, small)
+        return self._detect(image, small)
 
     def _look_near(
         self, image: Image | GreyFrame, face: list[float], lasting: bool
@@ -247,14 +260,14 @@ class FaceTracker(nn.Module):
         if round(scale * min(part.shape)) < 1:  # the face is outside, or all but outside
             return torch.zeros(0, 3, dtype=torch.float64)
         if 1 / _SAME_SIZE < scale < _SAME_SIZE:
-            scale, found = 1.0, self.detector(image, region)
+            scale, found = 1.0, self._detect(image, region)
             found = found - found.new_tensor([region.left, region.top, 0])
         else:
             part = resized(part, scale)
-            found = self.detector(part, _whole(part, region, scale))
+            found = self._detect(part, _whole(part, region, scale))
         for turn in turns:
             if not len(found):
-                found = _turned_search(self.detector, part, _whole(part, region, scale), turn)
+                found = _turned_search(self._detect, part, _whole(part, region, scale), turn)
         found = scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
         if len(found) > 1:  # of those that overlap only the first is kept: the likeliest
             found = found[(found - found.new_tensor(face)).norm(dim=1).argsort(stable=True)]

@@ -302,7 +302,11 @@ class GaussianMixture(NoHalfModule):
 
         Returns:
             Draws [*shape, D], in the dtype of the mixture.
+
+        Raises:
+            InputError: a shape that is no sequence of sizes, such as 5 in place of (5,).
         """
+        shape = _sizes(shape)
         n = math.prod(shape)
         weights = self.weights
         factor, rows = self.cholesky(), []
@@ -390,6 +394,17 @@ class GaussianMixture(NoHalfModule):
                 f"indices must be distinct and lie in 0..{self.dim - 1}, got {index.tolist()}"
             )
         return index
+
+
+def _sizes(shape: Sequence[int]) -> torch.Size:
+    """Return a shape, or raise `InputError` for what is none."""
+    try:
+        sizes = torch.Size(shape)
+    except TypeError:
+        sizes = None
+    if sizes is None or min(sizes, default=0) < 0:
+        raise InputError(f"shape must be a sequence of sizes, such as (5,), got {shape!r:.60}")
+    return sizes
 
 
 def _components(weights: Tensor, uniform: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from torchpose._core.value_checks import seen_finite
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.camera._tilt import Turn
-from torchpose.errors import InputError
+from torchpose.errors import InputError, SkeletonError
 from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._measurements import check_lengths
 from torchpose.io._keypoints import is_filled
@@ -479,7 +479,13 @@ def pixel_indices(joints: Sequence[str]) -> list[int]:
 
     Returns:
         Two indices for each joint.
+
+    Raises:
+        SkeletonError: a name that is not among them.
     """
+    unknown = [joint for joint in joints if joint not in ARM_JOINTS]
+    if unknown:
+        raise SkeletonError(f"joints must be among {', '.join(ARM_JOINTS)}, got {unknown[0]!r}")
     return [3 * ARM_JOINTS.index(joint) + axis for joint in joints for axis in (0, 1)]
 
 
