@@ -213,3 +213,16 @@ def test_dtypes(dtype):
     found = state_postures(body, state)
     assert found.dtype == dtype
     assert posture_to_state(body, found, state).dtype == dtype
+
+
+def test_gradients_at_rest_are_finite_whatever_is_missing():
+    """An angle of 90 degrees falls on every side; one beside it has the slope of a turned bone."""
+    for missing in ((), ("head",), ("left_wrist", "right_wrist")):
+        joints = joints_of(**{name: (math.nan,) * 3 for name in missing}).requires_grad_()
+        postures = posture_angles(joints)
+        for limb, expected in (("left_thigh", [1 / 0.45, 0, 0]), ("right_forearm", None)):
+            (slopes,) = torch.autograd.grad(angle(postures, limb)[0], joints, retain_graph=True)
+            assert bool(torch.isfinite(slopes).all())
+            if expected is not None:
+                found = torch.deg2rad(slopes[BODY_15.joint("left_knee")])
+                torch.testing.assert_close(found, torch.tensor(expected).double())

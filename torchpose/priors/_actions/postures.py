@@ -68,8 +68,8 @@ def posture_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batc
     if bool(short.any()):
         limb = LIMBS_12[int(torch.nonzero(short)[0, -1])]
         raise InputError(f"limb {limb.name!r} has no length in some frames; cut them out")
-    seen = torch.nn.functional.normalize(ends, dim=-1)
     rest = _axes("rest", joints)
+    seen = torch.nn.functional.normalize(torch.where(known[:, None], ends, rest), dim=-1)
     local = torch.empty_like(seen)
     axes = frame[..., None, :, :]
     for level in _LEVELS:
@@ -78,7 +78,7 @@ def posture_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batc
         u = torch.where(known[level.limbs, None], u, rest[level.limbs])
         local[..., level.limbs, :] = u
         axes = _carry(axes, u, level)
-    return torch.rad2deg(local.clamp(-1, 1).arcsin()).flatten(-2)
+    return _angles(local)
 
 
 def posture_root(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -134,7 +134,7 @@ def normalise_postures(postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*
     Args:
         postures: [..., 36], degrees.
     """
-    return torch.rad2deg(_local_directions(postures).clamp(-1, 1).arcsin()).flatten(-2)
+    return _angles(_local_directions(postures))
 
 
 def posture_directions(
@@ -216,6 +216,17 @@ def _local_directions(postures: Tensor) -> Tensor:
     sines = torch.deg2rad(postures.clamp(-90, 90)).sin().unflatten(-1, (-1, 3))
     none = sines.norm(dim=-1, keepdim=True) < _TINY
     return torch.nn.functional.normalize(torch.where(none, _axes("rest", sines), sines), dim=-1)
+
+
+def _angles(directions: Tensor) -> Tensor:
+    """Return the angles [..., 36] of unit directions [..., 12, 3] to the planes of their axes, degrees.
+
+    An angle of 90 degrees falls on every side, so that its gradient is 0: that of arcsin is infinite.
+    """
+    sines = directions.clamp(-1, 1)
+    if torch.is_grad_enabled():
+        sines = torch.where(sines.abs() < 1, sines, sines.detach())
+    return torch.rad2deg(sines.arcsin()).flatten(-2)
 
 
 def _torso_rotation(body: Body, rest: Tensor, bones: Tensor) -> Tensor:
