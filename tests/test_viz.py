@@ -15,6 +15,7 @@ from torchpose.errors import InputError, MissingDependencyError, OutputError, Sh
 from torchpose.viz import _style as style
 from torchpose.viz._body_picture import plot_body_strip
 from torchpose.viz._charts import _spans
+from torchpose.viz._skeletons import as_drawn
 
 
 @pytest.fixture(scope="module")
@@ -238,6 +239,51 @@ def test_bad_input_is_named(scene) -> None:
         viz.plot_joint_curves(scene.joints, show=["foot"])
     with pytest.raises(InputError, match="at least one"):
         viz.plot_pcp({})
+
+
+@pytest.mark.parametrize(
+    "draw", [viz.plot_pose, viz.plot_pose_3d, viz.plot_pose_strip, viz.plot_joint_curves]
+)
+def test_a_track_in_place_of_joints_and_other_sizes_beside_them_are_named(scene, draw) -> None:
+    one = draw in (viz.plot_pose, viz.plot_pose_3d)
+    joints = scene.joints[0, :, : 2 if draw is viz.plot_pose else 3] if one else scene.joints
+    track = SimpleNamespace(joints3d=scene.joints[None])
+    with pytest.raises(
+        InputError, match=r"joints must be a tensor, .* such as track.joints3d\[0\]"
+    ):
+        draw(track)
+    with pytest.raises(InputError, match="truth must be a tensor, got SimpleNamespace"):
+        draw(joints, truth=track)
+    with pytest.raises(ShapeError, match="truth must have shape"):
+        draw(joints, truth=joints[:3])
+    with pytest.raises(ShapeError, match="observed must have shape"):
+        draw(joints, observed=torch.ones(3, dtype=torch.bool))
+    if draw is not viz.plot_pose_strip:
+        with pytest.raises(ShapeError, match="covariance must have shape"):
+            draw(joints, covariance=torch.eye(3))
+
+
+def test_arrays_are_drawn_as_tensors_are() -> None:
+    drawn = as_drawn([None, 2], np.zeros((3, 2)), observed=np.ones(3, bool))
+    assert torch.equal(drawn[0], torch.zeros(3, 2).double()) and bool(drawn[2].all())
+    assert drawn[1] is None and drawn[3] is None
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        viz.plot_errors_over_time, viz.plot_error_bars, viz.plot_pcp, viz.plot_reliability,
+        viz.plot_prior_means,
+    ],
+)  # fmt: skip
+def test_curves_without_names_and_tracks_in_their_place_are_named(scene, draw) -> None:
+    track = SimpleNamespace(joints3d=scene.joints[None])
+    for given in (track, scene.joints):
+        with pytest.raises(InputError, match=r"must go by names, as in \{"):
+            draw(given)
+    if draw is not viz.plot_prior_means:
+        with pytest.raises(InputError, match=r"\['a'\] must be the result of torchpose.metrics"):
+            draw({"a": track})
 
 
 @pytest.mark.parametrize("draw", [viz.plot_joint_curves, viz.plot_pose_strip])

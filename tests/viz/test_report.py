@@ -235,6 +235,10 @@ def test_wrong_input_is_refused(tmp_path):
                             for n in ("joints3d", "observed", "lengths")})  # fmt: skip
     with pytest.raises(InputError, match=r"people\[0\] must be one sequence"):
         write_report(path, [two])
+    with pytest.raises(InputError, match="must be a list of tracks, got PoseTrack"):
+        write_report(path, track)
+    with pytest.raises(InputError, match=r"people\[0\] must be a PoseTrack, got Tensor"):
+        write_report(path, [track.joints3d])
     with pytest.raises(InputError, match="first_frames"):
         write_report(path, [track], first_frames=[1, 2])
     with pytest.raises(InputError, match="negative"):

@@ -34,6 +34,8 @@ def test_bad_input():
     gaussian = (torch.zeros(3), torch.eye(3), None)
     with pytest.raises(InputError, match="at least one Gaussian"):
         plot_rotations({})
+    with pytest.raises(InputError, match="gaussians must go by names"):
+        plot_rotations(gaussian)
     with pytest.raises(InputError, match="direction must have a length"):
         plot_rotations({"a": gaussian}, direction=(0.0, 0.0, 0.0))
     with pytest.raises(ShapeError, match="covariance must have shape"):

@@ -17,13 +17,14 @@ from torchpose.metrics._calibration import Coverage, chi2_quantile
 from torchpose.metrics._pose_errors import PCP
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.viz._pose_drawing import draw_curves
-from torchpose.viz._skeletons import _check_poses
+from torchpose.viz._skeletons import as_drawn
 from torchpose.viz._style import (
     INK,
     MUTED,
     NORMAL,
     PALE,
     add_legend,
+    check_named,
     join_unit,
     joint_colors,
     legend_line,
@@ -95,7 +96,7 @@ def prepare_joint_curves(
     first_frame: int = 0,
 ) -> Callable[[], Figure]:
     """Return what draws coordinates over time, which another process can do; see `plot_joint_curves`."""
-    _check_poses(joints)
+    joints, covariance, observed, truth = as_drawn(None, joints, covariance, observed, truth)
     rows = _indices(show)
     spread = gaps = None
     labels = [readable(name) for name in show]
@@ -163,10 +164,10 @@ def plot_errors_over_time(
         matplotlib `Figure`, two panels in a row.
 
     Raises:
-        ShapeError: errors of another shape. InputError: an unknown joint.
+        ShapeError: errors of another shape. InputError: an unknown joint, or errors without names.
             MissingDependencyError: matplotlib is missing.
     """
-    styles = method_styles(list(errors))
+    styles = _styles_of("errors", errors, "shape", "joint_errors")
     rows = _indices(show)
     columns = 2 if len(rows) > 1 else 1
     lines = math.ceil(len(rows) / columns)
@@ -192,6 +193,28 @@ def plot_errors_over_time(
         ax.set_visible(False)
     add_legend(figure, _line_entries(styles, f"{bound:g} {unit}" if bound is not None else None))
     return figure
+
+
+def _styles_of(
+    name: str, curves: Mapping[str, Any], field: str, source: str
+) -> dict[str, dict[str, Any]]:
+    """Return the style of each curve by its method.
+
+    Args:
+        name: of the curves, for messages. field: that each has. source: function of `torchpose.metrics` that
+            returns them.
+
+    Raises:
+        InputError: curves without names, or something else.
+    """
+    check_named(name, curves, f'{{"tracker": torchpose.metrics.{source}(...)}}')
+    for method, curve in curves.items():
+        if not hasattr(curve, field):
+            kind = type(curve).__name__
+            raise InputError(
+                f"{name}[{method!r}] must be the result of torchpose.metrics.{source}, got {kind}"
+            )
+    return method_styles(list(curves))
 
 
 def _line_entries(styles: Mapping[str, Mapping[str, Any]], bound: str | None = None) -> list[Any]:
@@ -220,19 +243,20 @@ def plot_error_bars(
         matplotlib `Figure`.
 
     Raises:
-        ShapeError: errors of another number of joints. InputError: no frame, or no method.
-            MissingDependencyError: matplotlib is missing.
+        ShapeError: errors of another number of joints. InputError: no frame, no method, or errors
+            without names. MissingDependencyError: matplotlib is missing.
     """
     require_matplotlib()
     from matplotlib.patches import Patch
 
-    styles = method_styles(list(errors))
+    styles = _styles_of("errors", errors, "shape", "joint_errors")
     figure = new_figure(9.2, 4.2, title)
     ax = style_axes(figure.add_subplot(), y=join_unit("mean error", unit))
     ax.grid(False, axis="x")
     width = 0.8 / len(errors)
     entries: list[Any] = []
     for i, (name, values) in enumerate(errors.items()):
+        values = torch.as_tensor(values)
         check_shape(f"errors[{name!r}]", values, ["...", 8])
         if values.numel() == 0:
             raise InputError(f"errors[{name!r}] must hold at least one frame, got none")
@@ -267,9 +291,10 @@ def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None
         matplotlib `Figure`.
 
     Raises:
-        InputError: `by_limb` and curves of other limbs. MissingDependencyError: matplotlib is missing.
+        InputError: curves without names, or `by_limb` and curves of other limbs. MissingDependencyError:
+            matplotlib is missing.
     """
-    styles = method_styles(list(curves))
+    styles = _styles_of("curves", curves, "overall", "pcp")
     parts: dict[str, list[int] | None] = {"upper arms and forearms": None}
     if by_limb:
         parts |= {"upper arms": [0, 2], "forearms": [1, 3]}
@@ -319,13 +344,14 @@ def plot_reliability(
         matplotlib `Figure`, a panel for each joint.
 
     Raises:
-        ShapeError: a curve of another number of joints. MissingDependencyError: matplotlib is missing.
+        ShapeError: a curve of another number of joints. InputError: curves without names.
+            MissingDependencyError: matplotlib is missing.
     """
     require_matplotlib()
     from matplotlib.patches import Patch
 
-    by_name = {"estimate": curves} if isinstance(curves, Coverage) else dict(curves)
-    styles = method_styles(list(by_name))
+    by_name = {"estimate": curves} if isinstance(curves, Coverage) else curves
+    styles = _styles_of("curves", by_name, "per_joint", "reliability")
     columns = min(4, len(names))
     lines = math.ceil(len(names) / columns)
     figure = new_figure(2.5 * columns, 2.6 * lines + 0.8, title)

@@ -20,6 +20,7 @@ from torchpose.viz._style import (
     PALE,
     RIGHT,
     add_legend,
+    check_named,
     legend_line,
     new_figure,
     to_numpy,
@@ -59,10 +60,12 @@ def plot_rotations(
         matplotlib `Figure`, a panel for each Gaussian.
 
     Raises:
-        InputError: nothing to draw, or no direction. ShapeError: sizes other than these.
+        InputError: nothing to draw, something without a name, or no direction. ShapeError: sizes other
+            than these.
 
     Reference: Daubney & Xie, Figure 3.
     """
+    check_named("gaussians", gaussians, '{"upper arm": (mean, covariance, None)}')
     if not gaussians:
         raise InputError("a picture of rotations needs at least one Gaussian, got none")
     axis = torch.as_tensor(direction, dtype=torch.float64)

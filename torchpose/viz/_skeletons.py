@@ -25,6 +25,7 @@ from torchpose.viz._style import (
     PALE,
     RIGHT,
     add_legend,
+    check_named,
     joint_colors,
     new_figure,
     style_axes,
@@ -47,6 +48,51 @@ class Mixture(Protocol):
 
     weights: Tensor
     means: Tensor
+
+
+def as_drawn(
+    sizes: Sequence[int | None] | None,
+    joints: Any,
+    covariance: Any = None,
+    observed: Any = None,
+    truth: Any = None,
+) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
+    """Return tensors of joints [..., D] and of what is drawn with them, all of which may be arrays.
+
+    Args:
+        sizes: of the joints; None is [T, 8, 2] or [T, 8, 3]. joints: [..., D]. covariance: [..., D, D].
+        observed: [...]. truth: [..., D].
+
+    Raises:
+        InputError: neither tensors nor arrays. ShapeError: other sizes.
+    """
+    drawn = _as_tensor("joints", joints)
+    if sizes is None:
+        _check_poses(drawn)
+    else:
+        check_shape("joints", drawn, sizes)
+    shape = tuple(drawn.shape)
+    return (
+        drawn,
+        _as_tensor("covariance", covariance, (*shape, shape[-1])),
+        _as_tensor("observed", observed, shape[:-1]),
+        _as_tensor("truth", truth, shape),
+    )
+
+
+def _as_tensor(name: str, value: Any, sizes: Sequence[int] | None = None) -> Any:
+    """Return a tensor or array as a tensor of these sizes; None stays, where sizes are given."""
+    if value is None and sizes is not None:
+        return None
+    if not hasattr(value, "shape"):
+        raise InputError(
+            f"{name} must be a tensor, got {type(value).__name__}; of a track give a field of one sequence, "
+            "such as track.joints3d[0] of a PoseTrack"
+        )
+    tensor = torch.as_tensor(value)
+    if sizes is not None:
+        check_shape(name, tensor, sizes)
+    return tensor
 
 
 def draw_skeleton(
@@ -73,9 +119,10 @@ def draw_skeleton(
         linewidth: the line width of the limbs, points. alpha: opacity of everything.
 
     Raises:
-        ShapeError: joints of another shape, or of another number than there are colours.
+        ShapeError: joints of another shape, or of another number than there are colours; covariances of
+            other sizes. InputError: no tensors, such as a whole track.
     """
-    check_shape("joints", joints, [None, 2])
+    joints, covariance, observed, _ = as_drawn([None, 2], joints, covariance, observed)
     colors = list(colors or joint_colors(UPPER_BODY))
     if len(colors) != joints.shape[0]:
         raise ShapeError(
@@ -138,9 +185,10 @@ def plot_pose(
         matplotlib `Figure`.
 
     Raises:
-        ShapeError: other sizes. MissingDependencyError: matplotlib is missing.
+        ShapeError: other sizes. InputError: no tensors, such as a whole track. MissingDependencyError:
+            matplotlib is missing.
     """
-    check_shape("joints", joints, [8, 2])
+    joints, covariance, observed, truth = as_drawn([8, 2], joints, covariance, observed, truth)
     figure = new_figure(6.4, 5.6, title)
     ax = style_axes(figure.add_subplot(), "u (pixels)", "v (pixels)", grid=image is None)
     if image is not None:
@@ -179,9 +227,10 @@ def plot_pose_3d(
         matplotlib `Figure` of three panels.
 
     Raises:
-        ShapeError: other sizes. MissingDependencyError: matplotlib is missing.
+        ShapeError: other sizes. InputError: no tensors, such as a whole track. MissingDependencyError:
+            matplotlib is missing.
     """
-    check_shape("joints", joints, [8, 3])
+    joints, covariance, observed, truth = as_drawn([8, 3], joints, covariance, observed, truth)
     figure = new_figure(11.0, 4.8, title)
     shown = [joints] if truth is None else [joints, truth]
     if covariance is not None:
@@ -271,7 +320,7 @@ def prepare_pose_strip(
     first_frame: int = 0,
 ) -> Callable[[], Figure]:
     """Return what draws a strip of frames, which another process can do; see `plot_pose_strip`."""
-    _check_poses(joints)
+    joints, _, observed, truth = as_drawn(None, joints, observed=observed, truth=truth)
     if labels is not None and len(labels) != len(joints):
         raise InputError(
             f"labels must be a word for each of {len(joints)} frames, got {len(labels)}"
@@ -337,12 +386,13 @@ def plot_prior_means(
         matplotlib `Figure`.
 
     Raises:
-        InputError: no mixture. ShapeError: states of fewer than 15 dimensions.
+        InputError: no mixture, or one without a name. ShapeError: states of fewer than 15 dimensions.
 
     The bar above a pose is its weight relative to the heaviest one's.
 
     Reference: Burke & Lasenby, Figure 6.
     """
+    check_named("mixtures", mixtures, '{"left": prior.left}')
     if not mixtures:
         raise InputError("mixtures must hold at least one mixture, got none")
     for name, mixture in mixtures.items():

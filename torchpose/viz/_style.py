@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,6 +118,14 @@ def label_row(ax: Axes, text: str) -> None:
     """Draw an upright label to the left of a panel without axes."""
     ax.text(0.0, 0.5, text, transform=ax.transAxes, rotation=90, va="center", ha="right",
             fontsize=SMALL, color=MUTED)  # fmt: skip
+
+
+def check_named(name: str, values: Any, example: str) -> None:
+    """Raise `InputError` unless what is drawn goes by names."""
+    if not isinstance(values, Mapping):
+        raise InputError(
+            f"{name} must go by names, as in {example}, got {type(values).__name__}; give it a name"
+        )
 
 
 def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:

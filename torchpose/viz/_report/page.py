@@ -75,10 +75,15 @@ def write_report(
         `path`.
 
     Raises:
-        InputError: a track of several sequences or none, counts that do not match, no such overlay.
+        InputError: a track in place of a list, one of several sequences or none, counts that do not match,
+            no such overlay.
         ShapeError: truth of another shape. OutputError: the page cannot be written.
     """
     path = Path(path)
+    if hasattr(people, "joints3d"):
+        raise InputError(
+            f"people must be a list of tracks, got {type(people).__name__}; give [track]"
+        )
     starts = [0] * len(people) if first_frames is None else list(first_frames)
     names = [f"person {i + 1}" for i in range(len(people))] if labels is None else list(labels)
     _check(people, starts, names, truth)
@@ -272,6 +277,8 @@ def _check(
     truth: Tensor | None,
 ) -> None:
     for i, track in enumerate(people):
+        if not hasattr(track, "joints3d"):
+            raise InputError(f"people[{i}] must be a PoseTrack, got {type(track).__name__}")
         if len(track) != 1 or track.joints3d.shape[1] == 0:
             raise InputError(
                 f"people[{i}] must be one sequence of at least one frame, got joints3d of shape "
