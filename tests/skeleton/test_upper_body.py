@@ -59,6 +59,7 @@ def test_spellings(spell):
         ("SHOULDER_CENTER", "shoulder_center"),
         ("SpineBase", "hip_center"),
         ("MidHip", "hip_center"),
+        ("CHip", "hip_center"),
         ("pelvis", "hip_center"),
         ("lhumerus", "elbow_left"),
         ("rradius", "wrist_right"),

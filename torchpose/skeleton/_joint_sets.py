@@ -72,7 +72,7 @@ _CENTRAL = {
     "spine_chest": "",
     "spine": "spinemid torso",
     "spine_navel": "spinenaval",
-    "hip_center": "hipcentre midhip pelvis root spinebase",
+    "hip_center": "hipcentre midhip chip pelvis root spinebase",  # chip: of Pose2Sim
 }
 
 
