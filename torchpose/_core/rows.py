@@ -1,4 +1,4 @@
-"""Choose between values of the same kind, row by row, and join their rows."""
+"""Choose between values of the same kind, row by row or the last ones known, and join their rows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar, cast
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 T = TypeVar("T")
@@ -27,6 +27,22 @@ def where_rows(rows: Bool[Tensor, "*rows"], new: T, old: T) -> T:
         return type(ours)(*(pick(*pair) for pair in zip(ours, others, strict=True)))
 
     return cast(T, pick(new, old))
+
+
+def last_known(known: Bool[Tensor, "B T *rest"]) -> Int[Tensor, "B T *rest"]:
+    """Return the last frame up to each one in which something was known, counted from 1; 0 before any."""
+    frames = torch.arange(1, known.shape[1] + 1, device=known.device)
+    return frames.view(-1, *[1] * (known.ndim - 2)).where(known, 0).cummax(1).values
+
+
+def in_frames(last: Int[Tensor, "B T *rest"], before: Tensor, values: Tensor) -> Tensor:
+    """Return values [B, T, ...] of the frames that `last_known` tells.
+
+    Args:
+        last: numbers of frames. before: [B, ...], of frame 0. values: of the frames from 1 on.
+    """
+    rows = last.view(*last.shape, *[1] * (values.ndim - last.ndim)).expand_as(values)
+    return torch.cat([before[:, None], values], 1).gather(1, rows)
 
 
 def joined(parts: Sequence[T], dim: int = 0) -> T:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import index_tensor
-from torchpose._core.rows import where_rows
+from torchpose._core.rows import in_frames, last_known, where_rows
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._measured_joints import MeasuredJoints
 
@@ -135,14 +135,9 @@ def _last_seen(
     if known.shape[1] == 1:
         older = before._replace(time=before.time + 1 / rate)
         return where_rows(known, now, LastSeen(*(values[:, None] for values in older)))
+    found = last_known(known)
+    kept = LastSeen(*(in_frames(found, *pair) for pair in zip(before, now, strict=True)))
     frames = torch.arange(1, known.shape[1] + 1, device=known.device)[:, None, None]
-    found = torch.where(known, frames, 0).cummax(1).values
-
-    def at(first: Tensor, values: Tensor) -> Tensor:
-        rows = found.view(*found.shape, *[1] * (values.ndim - found.ndim)).expand_as(values)
-        return torch.cat([first[:, None], values], 1).gather(1, rows)
-
-    kept = LastSeen(*(at(*pair) for pair in zip(before, now, strict=True)))
     return kept._replace(time=kept.time + (frames - found).to(kept.time) / rate)
 
 

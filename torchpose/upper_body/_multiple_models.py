@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.rows import in_frames, last_known
 from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._outputs import first_not_finite
 from torchpose.priors._arms import ArmPrior
@@ -283,10 +284,7 @@ def _held(
     """
     told, theirs = _some_arm(measured.mask), _packed(_poses_of(bodies))
     ours = _packed(poses)
-    apart = torch.cat([before[:, None], ours - theirs], 1)
-    frames = torch.arange(1, apart.shape[1], device=told.device)
-    last = frames.where(told, 0).cummax(1).values
-    apart = apart.gather(1, last[..., None].expand(-1, -1, apart.shape[2]))
+    apart = in_frames(last_known(told), before, ours - theirs)
     packed = torch.where(told[..., None] | apart.isnan(), ours, theirs + apart)
     joints, uv, place = packed.split([24, 16, 3], -1)
     held = poses._replace(
