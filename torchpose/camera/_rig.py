@@ -342,6 +342,11 @@ def as_rig(cameras: Cameras) -> CameraRig:
     return CameraRig(list(cameras))
 
 
+def centres_of_cameras(rig: CameraRig) -> Float[Tensor, "C 3"]:
+    """Return where cameras are, -R^T t, world axes."""
+    return -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
+
+
 def _named(cameras: Mapping[str, Any]) -> list[Any]:
     """Return the cameras of a mapping; its keys tell two of the same name apart."""
     named = []

@@ -17,7 +17,7 @@ from torchpose._core.stream_settings import StreamSettings, check_settings, sett
 from torchpose._core.uncompiled import uncompiled
 from torchpose.body._kinematics import Body
 from torchpose.camera._choice import check_room
-from torchpose.camera._rig import CameraRig, Cameras, as_rig
+from torchpose.camera._rig import CameraRig, Cameras, as_rig, centres_of_cameras
 from torchpose.errors import InputError
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
@@ -546,8 +546,9 @@ class BodyTracker(OwnPrecisionModule):
 
 def _in_words(rig: CameraRig) -> str:
     """Return the names of cameras, and roughly where they are, where they look to, and focal lengths."""
-    centres = -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
-    numbers = torch.cat([centres, rig.rotation[:, 2], rig.matrix[:, 0, :1]], -1).tolist()
+    numbers = torch.cat(
+        [centres_of_cameras(rig), rig.rotation[:, 2], rig.matrix[:, 0, :1]], -1
+    ).tolist()
     return ", ".join(
         f"{name} at {x:.2f} {y:.2f} {z:.2f} m along {a:.2f} {b:.2f} {c:.2f}, {focal:.0f} px"
         for name, (x, y, z, a, b, c, focal) in zip(rig.names, numbers, strict=True)

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torchpose._core.module_state import derived
 from torchpose.body._articulation import BodyPoint
 from torchpose.body._skeleton import BODY_15
-from torchpose.camera._rig import CameraRig
+from torchpose.camera._rig import CameraRig, centres_of_cameras
 from torchpose.math._gaussian import symmetrise
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._lifting_network import (
@@ -207,7 +207,7 @@ class PoseLifter(nn.Module):
 
 def are_side_by_side(rig: CameraRig) -> bool:
     """Return whether all cameras are so near each other that their keypoints are lifted; one camera is."""
-    centres = -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
+    centres = centres_of_cameras(rig)
     return float(torch.cdist(centres, centres).amax()) < _SIDE_BY_SIDE
 
 
