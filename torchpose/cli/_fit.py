@@ -208,12 +208,13 @@ def _without_persons(recordings: list["Recording"], persons: list[str]) -> list[
 
 def _check_options(given: Given) -> None:
     """Raise `InputError` for values out of range, and for options that exclude each other."""
+    from torchpose._core.checks import check_choice
     from torchpose.skeleton._upper_body import NECK_KINDS
 
     values = given.values
     neck = values["neck"]
-    if neck is not None and neck not in NECK_KINDS:
-        raise InputError(f"--neck must be one of {', '.join(NECK_KINDS)}, got {neck!r}")
+    if neck is not None:
+        check_choice("--neck", neck, NECK_KINDS)
     for key in ("components", "samples", *_AT_LEAST_ZERO):
         count, least = values[key], int(key not in _AT_LEAST_ZERO)
         if count is not None and count < least:

@@ -354,9 +354,8 @@ def mean_rotation(
     weighted = quaternions if weights is None else quaternions * weights[..., None]
     matrix = weighted.mT @ quaternions
     mean = safe_eigh(matrix.detach())[1][..., -1]
-    if (
-        torch.is_grad_enabled()
-    ):  # eigenvalues that are equal, as of turns about one axis, have no gradients
+    # eigenvalues that are equal, as of turns about one axis, have no gradients
+    if torch.is_grad_enabled():
         size = torch.finfo(matrix.dtype).eps * matrix.detach().diagonal(dim1=-2, dim2=-1).sum(-1)
         apart = size[..., None] * torch.arange(4).to(matrix)
         same = safe_eigh(matrix + torch.diag_embed(apart))[1][..., -1]

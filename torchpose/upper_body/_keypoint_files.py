@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from torchpose._core.checks import check_choice, check_count
 from torchpose._core.inference import in_inference_mode
 from torchpose.camera._choice import held_camera, resolve_camera
 from torchpose.camera._pinhole import PinholeCamera
@@ -329,8 +330,7 @@ def _check_count(name: str, value: int, method: str | None) -> None:
         raise InputError(
             f"{option} does not apply to --method {method}; it is of {', '.join(having)}"
         )
-    if value < 1:
-        raise InputError(f"{option} must be at least 1, got {value}")
+    check_count(option, value)
 
 
 def _joint_names(
@@ -352,6 +352,6 @@ def _joint_names(
 
 
 def _kind_of_neck(given: str | None, keypoints: Keypoints) -> str | None:
-    if given is not None and given not in NECK_KINDS:
-        raise InputError(f"--neck must be one of {', '.join(NECK_KINDS)}, got {given!r}")
+    if given is not None:
+        check_choice("--neck", given, NECK_KINDS)
     return given or keypoints.neck

@@ -69,13 +69,14 @@ def write_body_file(path: str | Path, motion: BodyMotion3d, up: str | None) -> N
     check_choice("the suffix of a file of bodies", kind, BODY_FORMATS)
     names, points, covariance = motion.points
     turn = _turn_to_y_up(up).to(points)
+    if kind == "bvh":
+        _write_skeleton(path, motion, turn)
+        return
     present = motion.present
     absent = present != torch.arange(len(present), device=present.device)
     points = (points @ turn.mT).masked_fill(absent[:, None, None], torch.nan)
     names = marker_names(names)
-    if kind == "bvh":
-        _write_skeleton(path, motion, turn)
-    elif kind == "trc":
+    if kind == "trc":
         write_trc(path, points, names, motion.fps, first_frame=motion.first_frame)
     else:
         write_c3d(
