@@ -42,6 +42,11 @@ class BodyData(LightningDataModule):
         if self.gathered is None:
             self.gathered = self.source.gather(**self._arguments)
 
+    @property
+    def said(self) -> list[str]:
+        """Return notes on the recordings, a line each."""
+        return [f"note: {note}" for note in self.gathered.notes]
+
     def train_dataloader(self) -> range:
         """Return one step an epoch."""
         return range(1)

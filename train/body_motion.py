@@ -5,8 +5,9 @@ from dataclasses import asdict
 from torchpose._core.checks import check_rate
 from torchpose.io._results import ResultsFolder
 from torchpose.learning._body_motion_fit import BodyMotionRecipe
-from torchpose.learning._fit_files import write_body_files
+from torchpose.learning._fit_files import write_body_model
 from torchpose.learning._recipes import RecordedMotion, fit_motion
+from torchpose.learning._recipes.body_motion import motion_summary
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["BodyMotionData", "BodyMotionFit"]
@@ -88,4 +89,5 @@ class BodyMotionFit(BodyFit):
 
     def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
         """Write the prior."""
-        return write_body_files(self.gathered, results, file, self._recipe, **facts)
+        found, held_out = fit_motion(self.gathered, self._recipe, **facts)
+        return write_body_model(found, motion_summary(found, held_out), results, file)

@@ -16,7 +16,6 @@ from lightning.pytorch.utilities import rank_zero_only
 from torchpose._core.files import check_output_folder
 from torchpose._core.terminal import show_progress, without_options
 from torchpose.errors import InputError
-from torchpose.learning._curation.curate import notes_on_recordings
 from torchpose.learning._selection import select_n_components
 from train.blocks import Key
 from train.callbacks import FitPictures, FitProgress, PriorWriter, StopAtOnce
@@ -28,7 +27,6 @@ __all__ = ["how_to_go_on", "run"]
 
 _MODEL = {"class_path": "train.mixture_em.MixtureEM"}
 _DATA = {"class_path": "train.data.RecordingsDataModule"}
-_SHOWN_DROPS = 5
 _DEFAULTS = {
     "max_epochs": -1,  # the recipe says how many steps there are
     "log_every_n_steps": 1,
@@ -173,13 +171,8 @@ class _Command(LightningCLI):
         """See that logs can be written, and read all recordings, before other processes are started."""
         folder = self.trainer.default_root_dir
         rank_zero_only(check_output_folder)(folder, "--trainer.default_root_dir")
-        data = self.datamodule
-        data.setup("fit")
-        if not hasattr(data, "report"):
-            return
-        notes = data.unread if data.report else [*notes_on_recordings(data.train), *data.unread]
-        said = [data.report.text(_SHOWN_DROPS)] if data.report else []
-        for line in (*said, *(f"note     {note}" for note in notes)):
+        self.datamodule.setup("fit")
+        for line in getattr(self.datamodule, "said", ()):  # other people's data say nothing
             rank_zero_only(print)(line, flush=True)
 
     def after_fit(self) -> None:

@@ -17,6 +17,7 @@ from torchpose.learning._curation import (
     pick_persons,
     refuse_leaks,
 )
+from torchpose.learning._curation.curate import notes_on_recordings
 from torchpose.learning._curation.splits import refuse_both_sides
 from torchpose.learning._recipes import VERSION, MixtureTask, UpperBodyRecipe
 from torchpose.learning._recipes.choosing import expand_path, fingerprint
@@ -29,6 +30,7 @@ D = TypeVar("D", bound=LightningDataModule)
 
 _RECIPE, _CURATION = UpperBodyRecipe(), CurationSettings()
 _HELD_OUT_SHARE = 5  # training states for each held-out state
+_SHOWN_DROPS = 5
 
 
 class RecordingsDataModule(LightningDataModule):
@@ -62,8 +64,8 @@ class RecordingsDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         self.recipe = recipe
-        self.report: CurationReport | None = None
-        self.unread: list[str] = []
+        self.said: list[str] = []
+        self._report: CurationReport | None = None
         self.train: list[Recording] = []
         self.watched: list[Recording] = []
         self.tasks: dict[str, MixtureTask] = {}
@@ -76,9 +78,8 @@ class RecordingsDataModule(LightningDataModule):
         """Read and split recordings, and list the mixtures; the second call does nothing."""
         if self.tasks:
             return
-        self.train, self.watched, self.report, self.unread = read_sides(
-            self._paths, self._axes, self._persons, self._held_out, self._curation
-        )
+        sides = read_sides(self._paths, self._axes, self._persons, self._held_out, self._curation)
+        self.train, self.watched, self._report, self.said = sides
         self.tasks = self.recipe.tasks(self.train)
         self.sources = {Key(name): cached(task.source) for name, task in self.tasks.items()}
         if self.watched:
@@ -109,7 +110,7 @@ class RecordingsDataModule(LightningDataModule):
 
     def facts(self) -> dict[str, Any]:
         """Return what a prior's file says about the curation, as that of `torchpose fit` does."""
-        return {} if self.report is None else self.report.for_prior()
+        return {} if self._report is None else self._report.for_prior()
 
     def sources_by_person(self) -> list[SampleSource]:
         """Return states over poses of each held-out person."""
@@ -133,14 +134,14 @@ class Sides(NamedTuple):
     """Holds recordings to fit to and those of held-out persons.
 
     Attributes:
-        report: on what was left out of the former; None if they are as they were read. unread: notes on
-            files that may be recordings and were passed over.
+        report: on what was left out of the former; None if they are as they were read.
+        said: lines on what was left out, and notes on what was read and on files that were not.
     """
 
     train: list[Recording]
     watched: list[Recording]
     report: CurationReport | None
-    unread: list[str]
+    said: list[str]
 
 
 def read_sides(
@@ -160,13 +161,14 @@ def read_sides(
     """
     given = [expand_path(path) for path in paths]
     files = find_recordings(given)
-    unread = notes_on_unread_files(given, files)
+    unread = [f"note     {note}" for note in notes_on_unread_files(given, files)]
     train, watched = split(read_recordings(files, axes), persons, held_out)
     if curation is None:
-        return Sides(train, watched, None, unread)
+        notes = [f"note     {note}" for note in notes_on_recordings(train)]
+        return Sides(train, watched, None, [*notes, *unread])
     kept, report = curate(train, curation)
     watched = curate(watched, curation).recordings if watched else []
-    return Sides(kept, watched, report, unread)
+    return Sides(kept, watched, report, [report.text(_SHOWN_DROPS), *unread])
 
 
 def split(

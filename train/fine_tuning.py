@@ -82,6 +82,7 @@ class FineTuningData(LightningDataModule):
         if steps_per_epoch < 1:
             raise InputError(f"steps_per_epoch must be at least 1, got {steps_per_epoch}")
         self.steps_per_epoch = steps_per_epoch
+        self.said: list[str] = []
         self.train: list[Recording] = []
         self.watched: list[Recording] = []
         self._paths, self._axes, self._curation = paths, axes, curation
@@ -97,7 +98,7 @@ class FineTuningData(LightningDataModule):
                 "one with --data.init_args.held_out"
             )
         sides = read_sides(self._paths, self._axes, self._persons, self._held_out, self._curation)
-        self.train, self.watched = sides.train, sides.watched
+        self.train, self.watched, self.said = sides.train, sides.watched, sides.said
 
     def train_dataloader(self) -> _Numbers:
         """Return the steps of an epoch."""

@@ -2,9 +2,9 @@
 
 from torchpose._core.checks import check_rate
 from torchpose.io._results import ResultsFolder
-from torchpose.learning._fit_files import write_limb_files
+from torchpose.learning._fit_files import write_body_model
 from torchpose.learning._recipes import LimbStates, fit_limbs
-from torchpose.learning._recipes.limbs import check_least_std
+from torchpose.learning._recipes.limbs import check_least_std, limb_summary
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["LimbData", "LimbFit"]
@@ -68,4 +68,5 @@ class LimbFit(BodyFit):
 
     def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
         """Write the conditionals."""
-        return write_limb_files(self.gathered, results, file, self.settings["least_std"], **facts)
+        found, held_out = fit_limbs(self.gathered, self.settings["least_std"], **facts)
+        return write_body_model(found, limb_summary(found, held_out), results, file)

@@ -50,6 +50,7 @@ def scene(tmp_path_factory) -> SimpleNamespace:
     """Three recordings, and a prior that has not seen the third person."""
     home = tmp_path_factory.mktemp("fine-tuning")
     write_recordings(home / "recordings", 3)
+    (home / "recordings" / "more.csv").write_text("nothing")
     recipe = UpperBodyRecipe(
         n_components=2, n_samples=600, pose_steps=5, window_components=2, window_samples=400,
         window_steps=3, calibration_folds=0,
@@ -170,11 +171,12 @@ def test_it_ends_when_held_out_persons_are_tracked_no_better(scene, monkeypatch)
     assert tuned(scene, "stopped").info.extra["fine_tuned"]["steps"] == 2
 
 
-def test_windows_are_tuned_with_their_mixtures(scene) -> None:
+def test_windows_are_tuned_with_their_mixtures(scene, capsys) -> None:
     more = ["--model.init_args.part", "causal", "--model.init_args.mixtures", "true"]
     more += ["--model.init_args.epochs", "1", "--model.init_args.learning_rate", "0.003"]
     more += ["--model.init_args.prior", str(scene.home / "windows.safetensors")]
     assert run(scene, "window", *more) == 0
+    assert "note     not read, since the folder holds recordings as .npz" in capsys.readouterr().out
     base, prior = tuned(scene, "windows"), tuned(scene, "window")
     assert torch.equal(prior.left.means, base.left.means)
     assert torch.equal(prior.windows["full"].left.means, base.windows["full"].left.means)

@@ -116,7 +116,7 @@ def test_it_is_resumed_only_with_its_own_settings(scene, capsys) -> None:
     assert "settings least_std was 0.01, is 0.02" in capsys.readouterr().err
 
 
-def test_notes_tell_of_gaps(scene, capsys) -> None:
+def test_notes_tell_of_gaps_and_unread_files(scene, capsys) -> None:
     folder = scene.home / "gaps"
     folder.mkdir()
 
@@ -125,10 +125,14 @@ def test_notes_tell_of_gaps(scene, capsys) -> None:
         arrays["joints"][200:, 8] = np.nan
 
     rewrite(write_trial(folder, "p6", 0), change)
+    (folder / "more.csv").write_text("nothing")
     assert run(scene, "gaps", "--data.held_out", "null", "--data.paths", f"['{folder}']") == 0
     said = capsys.readouterr().out
     assert "note: 2 frames with missing joints are interpolated, in gaps of up to 0.2 s" in said
     assert "p6_0.npz: 40 of 240 frames are left out" in said
+    assert (
+        "note: not read, since the folder holds recordings as .npz" in said.partition("9 limbs")[0]
+    )
 
 
 def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:

@@ -1,7 +1,7 @@
 """`torchpose fit manifold|limbs|actions|body`: what body trackers learn from recordings of whole bodies."""
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,18 +66,19 @@ def _results(
     given: Given, pictures: bool
 ) -> "Iterator[tuple[ResultsFolder, Path, dict[str, str]]]":
     """Return the folder of the model, its file, and its name, licence and command; all in use."""
-    from torchpose.io._recordings import find_recordings, notes_on_unread_files
     from torchpose.learning._fit_files import check_fit_file, fit_results
-    from torchpose.learning._recipes.choosing import expand_path
 
     values = given.values
     out = check_fit_file(values["out"])
     facts = {"name": values["name"] or out.stem, "licence": values["licence"]}
     with fit_results(out, given.files(), pictures) as results:
-        paths = [expand_path(path) for path in values["recordings"]]
-        for note in notes_on_unread_files(paths, find_recordings(paths)):
-            print(f"note: {note}", flush=True)
         yield results, out, facts | {"command": recorded_command(given)}
+
+
+def _print_notes(notes: Iterable[str]) -> None:
+    """Print notes on recordings before what is fitted to them, which may take long."""
+    for note in notes:
+        print(f"note: {note}", flush=True)
 
 
 def _gathered(gather: Callable[..., Any], *leave_out: str) -> tuple[Option, ...]:
@@ -138,6 +139,7 @@ def fit_manifold(
     with _results(given, pictures) as (results, file, facts):
         settings, pictures = ManifoldRecipe(**recipe), pictures_possible(pictures)
         poses = ManifoldPoses.gather(recordings, **choice, progress=show_progress())
+        _print_notes(poses.notes)
         fitting = ManifoldFitting(poses, settings)
         kept = file.with_name(f"{file.name}.partial")
         taken = taken_up(fitting, kept)
@@ -182,13 +184,15 @@ def fit_limbs(
         licence: licence of the recordings.
         given: the command.
     """
-    from torchpose.learning._fit_files import write_limb_files
-    from torchpose.learning._recipes.limbs import LimbStates, check_least_std
+    from torchpose.learning._fit_files import write_body_model
+    from torchpose.learning._recipes import limbs
 
     with _results(given, False) as (results, file, facts):
-        check_least_std(recipe["least_std"])
-        states = LimbStates.gather(recordings, **choice)
-        print(write_limb_files(states, results, file.name, recipe["least_std"], **facts))
+        limbs.check_least_std(recipe["least_std"])
+        states = limbs.LimbStates.gather(recordings, **choice)
+        _print_notes(states.notes)
+        found, held_out = limbs.fit_limbs(states, recipe["least_std"], **facts)
+        print(write_body_model(found, limbs.limb_summary(found, held_out), results, file.name))
     return 0
 
 
@@ -239,6 +243,7 @@ def fit_actions(
             raise InputError(f"--postures must be body or joints, got {postures!r}")
         settings, pictures = actions.ActionRecipe(**recipe), pictures_possible(pictures)
         performances = actions.Performances.gather(recordings, **choice, postures=postures)  # type: ignore[arg-type]
+        _print_notes(performances.notes)
         fitted = actions.fit_actions(performances, settings)
         print(write_action_files(fitted, results, file.name, pictures, **facts))
     return 0
@@ -278,13 +283,19 @@ def fit_body_motion(
         given: the command.
     """
     from torchpose.learning._body_motion_fit import BodyMotionRecipe
-    from torchpose.learning._fit_files import write_body_files
-    from torchpose.learning._recipes.body_motion import RecordedMotion
+    from torchpose.learning._fit_files import write_body_model
+    from torchpose.learning._recipes.body_motion import (
+        RecordedMotion,
+        fit_motion,
+        motion_summary,
+    )
 
     with _results(given, False) as (results, file, facts):
         settings = BodyMotionRecipe(**recipe)
         recorded = RecordedMotion.gather(recordings, **choice, progress=show_progress())
-        print(write_body_files(recorded, results, file.name, settings, **facts))
+        _print_notes(recorded.notes)
+        found, held_out = fit_motion(recorded, settings, **facts)
+        print(write_body_model(found, motion_summary(found, held_out), results, file.name))
     return 0
 
 

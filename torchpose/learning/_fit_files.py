@@ -1,7 +1,7 @@
 """Write the files of a fit: the model, its card (.md) and pictures of it (.png), all by `write_fit`."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -10,12 +10,8 @@ from torchpose._core.tensor_file import format_of
 from torchpose._core.wording import first_of
 from torchpose.errors import OutputError
 from torchpose.io._results import ResultsFolder
-from torchpose.learning._body_motion_fit import BodyMotionRecipe
 from torchpose.learning._model_card import MODES, BodyModel, body_card, model_card
 from torchpose.learning._recipes.actions import FittedActions
-from torchpose.learning._recipes.body_motion import RecordedMotion, fit_motion, motion_summary
-from torchpose.learning._recipes.gaps import notes_on_motion
-from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
@@ -105,6 +101,23 @@ def write_prior_files(
     return "\n".join([*lines, *(f"wrote    {path}" for path in written)])
 
 
+def write_body_model(
+    model: BodyModel,
+    summary: str,
+    results: ResultsFolder,
+    file: str,
+    pictures: Mapping[str, Callable[[], Any]] | None = None,
+) -> str:
+    """Write a model for body trackers, its card and pictures of it; return a report.
+
+    Args:
+        model: that was fitted. summary: of the fit, which the report begins with.
+        results, file, pictures: see `write_fit`.
+    """
+    written = write_fit(model, body_card(model, file=file), results, file, pictures)
+    return "\n".join([summary, f"wrote {', '.join(map(str, written))}", *results.notes])
+
+
 def write_manifold_files(
     fitting: ManifoldFitting, results: ResultsFolder, file: str, picture: bool = False, **facts: str
 ) -> str:
@@ -122,41 +135,7 @@ def write_manifold_files(
         return plot_manifold(manifold, {"held out": list(fitting.data.watched)[:1]})
 
     pictures = {f"{Path(file).stem}.png": draw} if picture else None
-    written = write_fit(manifold, body_card(manifold, file=file), results, file, pictures)
-    notes = notes_on_motion([*fitting.data.fitted, *fitting.data.held_out])
-    return f"{fitting.summary(manifold)}\n{_written(results, written, notes)}"
-
-
-def write_limb_files(
-    states: LimbStates, results: ResultsFolder, file: str, least_std: float = 0.01, **facts: str
-) -> str:  # fmt: skip
-    """Fit limb conditionals, write them and their card; return a report.
-
-    Args:
-        states: to fit to. results: folder of the files. file: name of the conditionals'.
-        least_std: see `fit_limbs`. facts: name, licence, command.
-    """
-    found, held_out = fit_limbs(states, least_std, **facts)
-    written = write_fit(found, body_card(found, file=file), results, file)
-    return f"{summary(found, held_out)}\n{_written(results, written, states.notes)}"
-
-
-def write_body_files(
-    recorded: RecordedMotion,
-    results: ResultsFolder,
-    file: str,
-    recipe: BodyMotionRecipe,
-    **facts: str,
-) -> str:
-    """Fit how bodies move, write it and its card; return a report.
-
-    Args:
-        recorded: to fit to. results: folder of the files. file: name of the model's. recipe: settings.
-        facts: name, licence, command.
-    """
-    found, held_out = fit_motion(recorded, recipe, **facts)
-    written = write_fit(found, body_card(found, file=file), results, file)
-    return f"{motion_summary(found, held_out)}\n{_written(results, written, recorded.notes)}"
+    return write_body_model(manifold, fitting.summary(manifold), results, file, pictures)
 
 
 def write_action_files(
@@ -169,25 +148,16 @@ def write_action_files(
         picture: draw the synchronised performances, which needs
             matplotlib. facts: name, licence, command.
     """
-    found, stem = fitted.result(**facts), Path(file).stem
+    stem, several = Path(file).stem, len(fitted.spaces) > 1
 
     def drawing(action: str) -> Callable[[], Any]:
         from torchpose.viz._model_pictures import plot_action_space
 
         return lambda: plot_action_space(*fitted.spaces[action])
 
-    several = len(fitted.spaces) > 1
     names = {f"{stem}-{a}.png" if several else f"{stem}.png": a for a in fitted.spaces}
     pictures = {name: drawing(action) for name, action in names.items()} if picture else None
-    card = body_card(found, facts.get("name", ""), file=file)
-    written = write_fit(found, card, results, file, pictures)
-    notes = notes_on_motion(fitted.performances.recordings)
-    return f"{fitted.summary()}\n{_written(results, written, notes)}"
-
-
-def _written(results: ResultsFolder, written: Sequence[Path], notes: Sequence[str]) -> str:
-    said = [f"note: {note}" for note in notes]
-    return "\n".join([*said, f"wrote {', '.join(map(str, written))}", *results.notes])
+    return write_body_model(fitted.result(**facts), fitted.summary(), results, file, pictures)
 
 
 def _prior_lines(prior: UpperBodyPrior) -> list[str]:

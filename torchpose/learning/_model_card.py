@@ -235,22 +235,18 @@ _LIMITS = (
 )
 
 
-def body_card(
-    model: BodyModel, name: str = "", results: str = "", chosen: str = "", file: str = ""
-) -> str:
+def body_card(model: BodyModel, results: str = "", chosen: str = "", file: str = "") -> str:
     """Return Markdown text on what a model is, what it was fitted to, and what it is not good for.
 
     Args:
         model: a manifold, limb conditionals, an action space or bank, or a prior over the motion of bodies.
-        name: of the model, where its file does not say. results: what it scored on persons whom it was
-            not fitted on, as Markdown.
+        results: what it scored on persons whom it was not fitted on, as Markdown.
         chosen: how settings were chosen, as Markdown.
         file: name of the model's file, by which it is used; of a model of the package its name is enough.
     """
+    name = model.info.name
     describe = next(text for kind, text in _DESCRIBED.items() if isinstance(model, kind))
-    what, rows, held_out, use, limits = describe(
-        model, file or getattr(model.info, "name", "") or "FILE"
-    )
+    what, rows, held_out, use, limits = describe(model, file or name or "FILE")
     sections = {
         "What it is": what,
         "Fitted on": card_table({**_body_data(model.info), **rows}),
@@ -260,7 +256,7 @@ def body_card(
         "Use": use,
         "Limits": f"{limits} {_LIMITS}",
     }
-    return card_text(getattr(model.info, "name", "") or name or "Body model", sections)
+    return card_text(name or "Body model", sections)
 
 
 _Told = tuple[str, dict[str, Any], str, str, str]

@@ -28,6 +28,7 @@ from torchpose.learning._recipes.choosing import (
     recording_name,
     state_of,
 )
+from torchpose.learning._recipes.gaps import notes_on_motion
 from torchpose.priors._actions.action_file import ActionInfo, BankInfo, Synchronised
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.postures import posture_angles, state_postures
@@ -72,7 +73,7 @@ class Performances:
     Attributes:
         actions: in the order asked for. fps: the frame rate of the postures. postures: "joints" or "body".
         train, watched: single performances. left_out: repetitions that are too short.
-        recordings: the recordings of both.
+        recordings: the recordings of both. notes: on these, and on files not read.
     """
 
     actions: tuple[str, ...]
@@ -83,6 +84,7 @@ class Performances:
     left_out: int
     recordings: list[Recording]
     repeated: bool
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def gather(
@@ -130,8 +132,9 @@ class Performances:
                     f"out or not among the persons, or no repetition lasts {LEAST_FRAMES} frames"
                 )
         watched = [p for p in found if p.person in out]
+        notes = (*chosen.unread, *notes_on_motion(recordings))
         return cls(
-            tuple(actions), fps, postures, train, watched, left_out, recordings, repeated
+            tuple(actions), fps, postures, train, watched, left_out, recordings, repeated, notes
         )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:

@@ -43,7 +43,8 @@ class RecordedMotion:
 
     Attributes:
         fps: most frames per second of the sequences. train, watched: of each recording, `watched` those of
-            persons who are held out. fitted, held_out: the recordings, cut at long gaps. notes: on these.
+            persons who are held out. fitted, held_out: the recordings, cut at long gaps.
+        notes: on these, and on files not read.
     """
 
     fps: float
@@ -77,7 +78,7 @@ class RecordedMotion:
             InputError: as `choose_recordings` and `recorded_joints`, or a rate that is not positive.
         """
         check_rate("fps", fps)
-        learnt, watched = choose_recordings(
+        learnt, watched, unread = choose_recordings(
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
         learnt, left_out = whole_pieces(learnt)
@@ -104,7 +105,7 @@ class RecordedMotion:
                     _set_of(recording),
                 )
             )  # fmt: skip
-        notes = (*notes_on_motion(both, still=False), *left_out, *more)
+        notes = (*unread, *notes_on_motion(both, still=False), *left_out, *more)
         return cls(fps, found[:n], found[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:

@@ -18,7 +18,12 @@ from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._mocap import resample_frames
-from torchpose.io._recordings import Recording, find_recordings, read_recordings
+from torchpose.io._recordings import (
+    Recording,
+    find_recordings,
+    notes_on_unread_files,
+    read_recordings,
+)
 from torchpose.learning._curation.splits import (
     pick_persons,
     refuse_both_sides,
@@ -28,10 +33,15 @@ from torchpose.learning._recipes.gaps import LONGEST_GAP, fill_short_gaps, missi
 
 
 class ChosenRecordings(NamedTuple):
-    """Holds the recordings to fit to, and those of held-out persons, each in the order of the files."""
+    """Holds the recordings to fit to, and those of held-out persons, each in the order of the files.
+
+    Attributes:
+        unread: notes on files that may be recordings and were passed over.
+    """
 
     train: list[Recording]
     watched: list[Recording]
+    unread: list[str]
 
 
 def choose_recordings(
@@ -59,7 +69,8 @@ def choose_recordings(
         InputError: unknown persons, actions or files, or nobody left to learn from. OverlapError: a
             person on both sides, or a recording, under another person.
     """
-    files = find_recordings([expand_path(path) for path in paths])
+    given = [expand_path(path) for path in paths]
+    files = find_recordings(given)
     unknown = sorted(set(without or ()) - {file.stem for file in files})
     if unknown:
         raise InputError(f"without: no file named {', '.join(unknown)} among the recordings")
@@ -81,6 +92,7 @@ def choose_recordings(
     found = ChosenRecordings(
         [r for r in recordings if r.person_id in wanted],
         [r for r in recordings if r.person_id in out],
+        notes_on_unread_files(given, files),
     )
     if not found.train:
         raise InputError(

@@ -43,7 +43,7 @@ class LimbStates:
     Attributes:
         body: whose frame and centres the states have. fps: the frame rate of the states.
         train, watched: [T, D] for each recording, `watched` those of persons who are held out.
-        fitted, held_out: the recordings, cut at long gaps. notes: on these.
+        fitted, held_out: the recordings, cut at long gaps. notes: on these, and on files not read.
     """
 
     body: Body
@@ -76,7 +76,7 @@ class LimbStates:
             InputError: as `choose_recordings` and `recorded_joints`, or a rate that is not positive.
         """
         check_rate("fps", fps)
-        learnt, watched = choose_recordings(
+        learnt, watched, unread = choose_recordings(
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
         learnt, left_out = whole_pieces(learnt)
@@ -92,7 +92,7 @@ class LimbStates:
         centred = {person: body.altered(centres=centres) for person, body in bodies.items()}
         # fitted again, since the twist that joints do not tell is zero about the centres
         states = [state_of(centred[r.person_id], r, j) for r, j in zip(both, joints, strict=True)]
-        notes = (*notes_on_motion(both), *left_out, *more)
+        notes = (*unread, *notes_on_motion(both), *left_out, *more)
         return cls(centred[first], fps, states[:n], states[n:], learnt, watched, notes)
 
     def identity(self) -> dict[str, Any]:
@@ -178,7 +178,7 @@ def held_out_spread(
     )
 
 
-def summary(conditionals: LimbConditionals, held_out: LimbSpread | None) -> str:
+def limb_summary(conditionals: LimbConditionals, held_out: LimbSpread | None) -> str:
     """Return a one-sentence summary of the fit."""
     info = conditionals.info
     text = (

@@ -36,6 +36,7 @@ from torchpose.learning._recipes.choosing import (
     recording_name,
     state_of,
 )
+from torchpose.learning._recipes.gaps import notes_on_motion
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._manifold.manifold_file import ManifoldInfo
 
@@ -82,7 +83,7 @@ class ManifoldPoses:
 
     Attributes:
         train, watched: [T, Q] for each recording. fps: the frame rate of `watched`; `train` is thinned out.
-        info: what they are of. fitted, held_out: the recordings.
+        info: what they are of. fitted, held_out: the recordings. notes: on these, and on files not read.
     """
 
     train: list[Tensor]
@@ -91,6 +92,7 @@ class ManifoldPoses:
     info: ManifoldInfo
     fitted: list[Recording]
     held_out: list[Recording]
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def gather(
@@ -124,10 +126,9 @@ class ManifoldPoses:
                 settings out of range. OverlapError: a recording on both sides.
         """
         check_gathering(validation, frames, fps)
-        chosen = choose_recordings(
+        fitted, watched, unread = choose_recordings(
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
-        fitted, watched = chosen
         if not watched:
             fitted, watched = _last_apart(fitted, validation)
         both, n = [*fitted, *watched], len(fitted)
@@ -140,7 +141,8 @@ class ManifoldPoses:
         several = len(facts["persons"]) > 1
         facts["sequences"] = tuple(r.person_id if several else recording_name(r) for r in fitted)
         info = ManifoldInfo.of_body(bodies[fitted[0].person_id], fps=fps, **facts)
-        return cls(thin(poses[:n], frames), poses[n:], fps, info, fitted, watched)
+        notes = (*unread, *notes_on_motion(both))
+        return cls(thin(poses[:n], frames), poses[n:], fps, info, fitted, watched, notes)
 
     def identity(self) -> dict[str, Any]:
         """Return frame rate and digests of poses and recordings, equal for equal fits."""
@@ -246,16 +248,18 @@ def run_to_end(
         while not fitting.finished:
             found = fitting.step()
             if kept is not None:
-                with atomic_path(kept) as temporary:
-                    kept_fit = {"of": _same_for(fitting), "fit": fitting.state_dict()}
-                    buffer = (
-                        BytesIO()
-                    )  # torch.save says of a full disk only that it is at a wrong place
-                    torch.save(kept_fit, buffer)
-                    temporary.write_bytes(buffer.getvalue())
+                _keep(fitting, kept)
             bar.set_postfix_str(f"held-out error {found['held_out']:.5f}", refresh=False)
             bar.update()
     return fitting
+
+
+def _keep(fitting: ManifoldFitting, kept: str | Path) -> None:
+    """Write the whole state of a fit."""
+    buffer = BytesIO()  # torch.save says of a full disk only that it is at a wrong place
+    torch.save({"of": _same_for(fitting), "fit": fitting.state_dict()}, buffer)
+    with atomic_path(kept) as temporary:
+        temporary.write_bytes(buffer.getvalue())
 
 
 def _same_for(fitting: ManifoldFitting) -> dict[str, Any]:
