@@ -11,7 +11,6 @@ a run that was stopped goes on.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -36,6 +35,7 @@ from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
 from torchpose.evaluation._trials import CAMERA, MEASURED, Estimate, Trials, cached_prior
 from torchpose.io import Recording
+from torchpose.io._recordings import cut_recording
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
@@ -139,7 +139,7 @@ def ub_people(options: Options) -> tuple[list[Recording], Trials]:
 def ub_one(options: Options) -> tuple[list[Recording], Trials]:
     """Return the first part of the authors' own recording, and frames of the rest."""
     first, rest = split_recording(options.data)
-    return [first], trials_of([replace(rest, joints=rest.joints[: options.frames or None])])
+    return [first], trials_of([cut_recording(rest, 0, options.frames or None)])
 
 
 PROTOCOLS: dict[str, Callable[[Options], tuple[list[Recording], Trials]]] = {

@@ -48,6 +48,7 @@ from torchpose.evaluation._trials import (
     track,
 )
 from torchpose.io import Recording, read_recordings
+from torchpose.io._recordings import cut_recording
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import UpperBodyTracker
@@ -63,6 +64,7 @@ TRACKERS = {
     "PF mixture, Q of the MKF": "pf-mixture",
 }
 BURN_IN = 15
+_TRAINED_SHARE = 0.6  # of the frames
 MIXTURE_Q, WALK_Q = 4.0, 0.3
 """Factors of Q: of the released one for the mixture proposal, of `walk_process_cov` for the walks.
 
@@ -110,7 +112,7 @@ def run(
         settings["n_components"] = n_components or 8
     if quick:
         particles, n_seeds = min(particles, 200), 1
-        tested = replace(tested, joints=tested.joints[:60])
+        tested = cut_recording(tested, 0, 60)
     prior = cached_prior(out, [train], recipe, progress, **settings)
     prior.check_unseen({tested.person_id})
     test = trials_of([tested], seed)
@@ -152,11 +154,11 @@ def run(
     return report
 
 
-def split_recording(data: str | Path, share: float = 0.6) -> tuple[Recording, Recording]:
+def split_recording(data: str | Path) -> tuple[Recording, Recording]:
     """Return the first frames and the rest, as recordings of two 'persons', so that none is scored twice.
 
     Args:
-        data: folder burke_kinect, or the one it is in. share: of the first part.
+        data: folder burke_kinect, or the one it is in.
 
     Raises:
         InputError: not one recording there, or too short.
@@ -167,12 +169,11 @@ def split_recording(data: str | Path, share: float = 0.6) -> tuple[Recording, Re
             f"{data}: expected one recording of 10 frames or more, got {[len(r) for r in found]}"
         )
     whole = found[0]
-    n = round(share * len(whole))
+    n = round(_TRAINED_SHARE * len(whole))
     parts = []
-    for rows in (slice(0, n), slice(n, len(whole))):
-        person = f"{whole.person}, frames {rows.start + 1} to {rows.stop}"
-        weights = None if whole.weights is None else whole.weights[rows]
-        parts.append(replace(whole, joints=whole.joints[rows], person=person, weights=weights))
+    for start, stop in ((0, n), (n, len(whole))):
+        person = f"{whole.person}, frames {start + 1} to {stop}"
+        parts.append(replace(cut_recording(whole, start, stop), person=person))
     return parts[0], parts[1]
 
 

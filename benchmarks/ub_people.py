@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +58,7 @@ from torchpose.evaluation._trials import (
     make_test_set,
 )
 from torchpose.io import Recording, read_recordings
+from torchpose.io._recordings import cut_recording
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
@@ -152,18 +152,8 @@ def people(data: str | Path, quick: bool = False) -> tuple[list[Recording], list
         )
     if quick:
         few = tested[:: max(1, len(tested) // 10)]
-        return train[:: max(1, len(train) // 40)], [_begun(r) for r in few]
+        return train[:: max(1, len(train) // 40)], [cut_recording(r, 0, _QUICK_FRAMES) for r in few]
     return train, tested
-
-
-def _begun(recording: Recording) -> Recording:
-    """Return the first frames of a recording."""
-    weights = recording.weights
-    return replace(
-        recording,
-        joints=recording.joints[:_QUICK_FRAMES],
-        weights=None if weights is None else weights[:_QUICK_FRAMES],
-    )
 
 
 def sway(n_frames: int, fps: float, phase: float = 0.0) -> Float[Tensor, "T 3"]:

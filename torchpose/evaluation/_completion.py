@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import PriorError, SkeletonError
-from torchpose.io._recordings import Recording
+from torchpose.io._recordings import Recording, cut_recording
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 
@@ -156,11 +156,7 @@ def facing_pieces(recording: Recording) -> list[Recording]:
     closed = torch.cat([facing.new_zeros(1), facing, facing.new_zeros(1)]).int()
     edges = torch.nonzero(closed.diff()).flatten().tolist()
     return [
-        replace(
-            recording,
-            joints=recording.joints[start:stop],
-            weights=None if recording.weights is None else recording.weights[start:stop],
-        )
+        cut_recording(recording, start, stop)
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
         if stop - start >= _SHORTEST
     ]

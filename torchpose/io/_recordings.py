@@ -7,7 +7,7 @@ format reads a file; here its contents are checked and converted.
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -198,6 +198,21 @@ def _read_recording(
             ghosts.append(f"other body {raw.companion} is left out: {reason}")
     recordings[0].notes += tuple(ghosts)
     return recordings
+
+
+def cut_recording(recording: Recording, start: int, stop: int | None = None) -> Recording:
+    """Return some frames of a recording.
+
+    Args:
+        recording: of all frames. start: the first frame. stop: the first one left out; None is the end.
+    """
+    weights = recording.weights
+    return replace(
+        recording,
+        joints=recording.joints[start:stop],
+        weights=None if weights is None else weights[start:stop],
+        first_frame=recording.first_frame + start,
+    )
 
 
 def read_recordings(

@@ -1,7 +1,6 @@
 """Fill short gaps of recordings, and cut recordings at long ones: motion is fitted to whole bodies."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +9,7 @@ from torch import Tensor
 from torchpose._core.wording import counted, first_of
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.errors import InputError
-from torchpose.io._recordings import Recording
+from torchpose.io._recordings import Recording, cut_recording
 from torchpose.learning._curation.splits import notes_of_reading, same_names
 from torchpose.math._hermite import hermite
 
@@ -72,7 +71,7 @@ def whole_pieces(recordings: Sequence[Recording]) -> tuple[list[Recording], tupl
         if length == len(recording):
             pieces.append(recording)
             continue
-        pieces += [_cut(recording, start, stop) for start, stop in runs]
+        pieces += [cut_recording(recording, *run) for run in runs]
         notes.append(
             f"{_file_of(recording)}: {len(recording) - length} of {len(recording)} frames are left out, in "
             f"or beside gaps of more than {LONGEST_GAP:g} s"
@@ -127,16 +126,6 @@ def _whole_runs(recording: Recording) -> list[tuple[int, int]]:
     starts, stops = ((edges == sign).nonzero().squeeze(-1) for sign in (1, -1))
     long = stops - starts >= _SHORTEST_PIECE * recording.fps
     return list(zip(starts[long].tolist(), stops[long].tolist(), strict=True))
-
-
-def _cut(recording: Recording, start: int, stop: int) -> Recording:
-    weights = recording.weights
-    return replace(
-        recording,
-        joints=recording.joints[start:stop],
-        weights=None if weights is None else weights[start:stop],
-        first_frame=recording.first_frame + start,
-    )
 
 
 def _body(recording: Recording) -> Float[Tensor, "T 15 3"]:
