@@ -37,6 +37,7 @@ __all__ = [
 
 LIFTERS = ("nearest neighbour", "MLP", "GRU, causal")
 _BONES = 12  # numbers: two bones of two arms
+_SEED = 0  # of samples and start
 _STEPS, _SEQUENCES, _FRAMES, _WIDTH = 4_000, 32, 48, 128
 _NEIGHBOURS = 60_000  # frames that are kept
 _TARGET = 0.2  # metres
@@ -100,18 +101,17 @@ def fit_lifter(
     sets: Sequence[tuple[float, Sequence[Tensor]]],
     arms: ArmPrior,
     hand: str,
-    seed: int = 0,
-    quick: bool = False,
+    quick: bool,
 ) -> Lifter:
     """Return a lifter that was trained on sets of recordings.
 
     Args:
         kind: one of `LIFTERS`. sets: share and joints [T, 8, 3] of each. arms: whose lengths of bones are
-            taken. hand: "hand" or "wrist", where forearms end. seed: of samples and start.
+            taken. hand: "hand" or "wrist", where forearms end.
         quick: few steps, to see that it works.
     """
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(_SEED)
+    torch.manual_seed(_SEED)
     draw = _Examples(sets, arms, hand, generator)
     if kind == LIFTERS[0]:
         rounds = range(2 if quick else _NEIGHBOURS // (_SEQUENCES * _FRAMES))

@@ -83,7 +83,7 @@ def leave_out(data: Path, name: str, quick: bool, kinds: Sequence[str] = LIFTERS
     known = {other: share for other, share in bones.SETS.items() if other != name}
     known = {_ONE: known[_ONE]} if quick else known
     sets = [(share, _joints(bones.recordings(data / o))) for o, share in known.items() if kinds]
-    lifters = {kind: fit_lifter(kind, sets, arms, hand, quick=quick) for kind in kinds}
+    lifters = {kind: fit_lifter(kind, sets, arms, hand, quick) for kind in kinds}
     return Unseen(views, few, prior, arms, lifters)
 
 

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks._seeds import generator_of, seed_of
 from benchmarks.bodies.clips import AZIMUTHS, Split, in_view, place_cameras, whole_frames
 from benchmarks.bodies.silhouettes import true_silhouettes
 from torchpose.body import Body, fit_body, fit_state
 from torchpose.camera import CameraRig
 from torchpose.demo._rendering.clothed_body import TrueShape
 from torchpose.errors import InputError
-from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip
 from torchpose.metrics import joint_errors
 from torchpose.whole_body import count_pixels
@@ -156,11 +156,6 @@ def any_heading(std: Float[Tensor, " D"], up: Float[Tensor, "3"]) -> Float[Tenso
     return std
 
 
-def _person_seed(person: str, seed: int) -> int:
-    """Return the seed of a person's shape, the same in all conditions of a run."""
-    return int(settings_hash([person, seed])[:8], 16)
-
-
 def body_of(clips: Sequence[MocapClip], conditions: Conditions) -> Body:
     """Fit bone lengths to all frames, radii to a few frames of the first clip that cameras see.
 
@@ -214,6 +209,6 @@ def _seen(clip: MocapClip, conditions: Conditions) -> tuple[CameraRig, Bool[Tens
             f"{clip.trial}: no camera sees the person; cameras must be in the axes and metres of the "
             "recordings"
         )
-    shape = TrueShape.draw(_person_seed(clip.person, conditions.seed))
-    generator = torch.Generator().manual_seed(_person_seed(clip.trial, conditions.seed))
+    shape = TrueShape.draw(seed_of(clip.person, conditions.seed))  # the same in all conditions
+    generator = generator_of(clip.trial, conditions.seed)
     return rig, true_silhouettes(clip, shape, rig, conditions.faults, generator)

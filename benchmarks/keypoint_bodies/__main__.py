@@ -47,6 +47,7 @@ from benchmarks.keypoint_bodies.clips import (
     RIGS,
     SCORED,
     Clip,
+    Faults,
     begun,
     read_clips,
     read_kinect,
@@ -55,7 +56,7 @@ from benchmarks.keypoint_bodies.desk import add_desk_table
 from benchmarks.keypoint_bodies.hidden import add_hidden_table
 from benchmarks.keypoint_bodies.lifting import fit_shipped, fit_upper_body
 from benchmarks.keypoint_bodies.lying import add_lying_table
-from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, OURS, Method, methods_of, takes
+from benchmarks.keypoint_bodies.methods import LIFTERS, METHODS, OURS, Method, methods_of
 from benchmarks.keypoint_bodies.real import add_real_table
 from benchmarks.keypoint_bodies.sitting import add_sitting_table
 from benchmarks.keypoint_bodies.tables import add_table
@@ -112,48 +113,45 @@ def main(
     if fit is not None:
         (fit_upper_body if upper_body else fit_shipped)(data, quick).save(fit)
         return
-    report = Report("Whole bodies from keypoints")
+
+    def those(names: Sequence[str]) -> dict[str, Method]:
+        return methods_of([name for name in methods if name in names], data, lifters, quick)
+
+    def rings(names: Mapping[str, Sequence[str]]) -> dict[str, list[Clip]]:
+        return _rings(data, names, NOISE_ALONE if noise_alone else FAULTS, quick)
+
+    report, of_one_camera = Report("Whole bodies from keypoints"), (*OURS, *LIFTERS)
     if desk:
-        ours = [name for name in methods if name in OURS]
-        add_desk_table(report, methods_of(ours, data, None, quick), data, quick)
-        print_tables(report, out)
-        return
-    if hidden:
+        add_desk_table(report, those(OURS), data, quick)
+    elif hidden:
         add_hidden_table(report, data, quick)
-        print_tables(report, out)
-        return
-    if uncalibrated:
-        lifting = [name for name in methods if name in LIFTERS]
-        add_tilt_tables(report, methods_of(lifting, data, lifters, quick), data, quick)
-        print_tables(report, out)
-        return
-    names = CHOOSING if choose else SCORED
-    if quick:
-        names = {folder: chosen[:1] for folder, chosen in names.items()}
-    clips = read_clips(data, names, faults=NOISE_ALONE if noise_alone else FAULTS)
-    if quick:
-        clips = {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
-    if choose:
-        add_choices(report, clips)
-    elif heights or sitting or lying:
-        chosen = {
-            name: one
-            for name, one in methods_of(methods, data, lifters, quick).items()
-            if takes(name, 1)
-        }
-        if sitting:
-            add_sitting_table(report, chosen, data, quick)
-        elif lying:
-            add_lying_table(report, chosen, data, quick)
-        else:
-            _add_heights(report, chosen, clips, data, quick)
+    elif uncalibrated:
+        add_tilt_tables(report, those(LIFTERS), data, quick)
+    elif choose:
+        add_choices(report, rings(CHOOSING))
+    elif sitting:
+        add_sitting_table(report, those(of_one_camera), data, quick)
+    elif lying:
+        add_lying_table(report, those(of_one_camera), data, quick)
+    elif heights:
+        _add_heights(report, those(of_one_camera), rings(SCORED), data, quick)
     else:
-        chosen = methods_of(methods, data, lifters, quick)
+        every, clips = those(_ALL), rings(SCORED)
         for cameras in (count for count in RIGS if count > 1 or not noise_alone):
-            add_table(report, chosen, clips, cameras)
+            add_table(report, every, clips, cameras)
         if not noise_alone:
-            _add_recorded_views(report, chosen, data, quick)
+            _add_recorded_views(report, every, data, quick)
     print_tables(report, out)
+
+
+def _rings(
+    data: Path, names: Mapping[str, Sequence[str]], faults: Faults, quick: bool
+) -> dict[str, list[Clip]]:
+    """Return recordings in rings of cameras, by set."""
+    if not quick:
+        return read_clips(data, names, faults=faults)
+    clips = read_clips(data, {folder: some[:1] for folder, some in names.items()}, faults=faults)
+    return {folder: [begun(clip) for clip in group] for folder, group in clips.items()}
 
 
 def _add_heights(

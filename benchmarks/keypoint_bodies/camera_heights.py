@@ -13,10 +13,9 @@ from typing import Any
 import torch
 from tqdm.auto import tqdm
 
-from benchmarks.keypoint_bodies.clips import KINECT, KINECT_TRAINING, Clip, recorded
-from benchmarks.keypoint_bodies.methods import CAUSAL, OURS, Method
+from benchmarks.keypoint_bodies.clips import KINECT, KINECT_TRAINING, Clip, pair_of, recorded
+from benchmarks.keypoint_bodies.methods import OURS, Method, row_of
 from benchmarks.keypoint_bodies.scoring import Score, score
-from torchpose.body import BODY_15
 from torchpose.evaluation import Report
 
 _HEIGHTS = {
@@ -29,7 +28,6 @@ _HEIGHTS = {
 }
 """Rows of a method, and by how many metres their height is wrong; None is not given."""
 _ANKLE = 0.09  # metres above the floor
-_ANKLES = [BODY_15.joint(f"{side}_ankle") for side in ("left", "right")]
 _MEASURES = {"all": "error", "rigid": "rigid", "with scale": "similar", "50 %": "inside_50",
              "90 %": "inside_90"}  # fmt: skip
 
@@ -37,7 +35,7 @@ _MEASURES = {"all": "error", "rigid": "rigid", "with scale": "similar", "50 %": 
 def height_of_kinect(data: Path) -> float:
     """Return the height of the Kinect of UTD-MHAD above the floor, metres."""
     lowest = [
-        (-clip.joints[:, _ANKLES].double() @ clip.up.double()).amax(-1)
+        (-clip.joints[:, pair_of("ankle")].double() @ clip.up.double()).amax(-1)
         for clip in recorded(data / KINECT, KINECT_TRAINING)
     ]
     return float(torch.cat(lowest).median()) + _ANKLE
@@ -63,11 +61,12 @@ def add_height_table(
         "is given, so is `up`.",
     )  # fmt: skip
     for name, method in tqdm(methods.items(), desc=title):
-        row = f"{name} *" if name in CAUSAL else name
         for label, wrong in (_HEIGHTS if name in OURS else {"": None}).items():
             scores = [_scored(method, clip, height, wrong) for clip in clips]
             mean = Score(*torch.tensor(scores).nanmean(0).tolist())
-            table.add(f"{row}{label}", [getattr(mean, field) for field in _MEASURES.values()])
+            table.add(
+                f"{row_of(name)}{label}", [getattr(mean, field) for field in _MEASURES.values()]
+            )
 
 
 def _scored(method: Method, clip: Clip, height: float | None, wrong: float | None) -> Score:
@@ -78,5 +77,4 @@ def _scored(method: Method, clip: Clip, height: float | None, wrong: float | Non
         centre = -clip.rig.rotation[0].mT @ clip.rig.translation[0]
         known = float(centre @ clip.up) if height is None else height
         options = {"up": "xyz"[int(up)], "camera_height": known + wrong}
-    seen = clip.seen
-    return score(method(clip.rig, seen.keypoints, seen.confidence, clip.fps, **options), clip)
+    return score(method(*clip.given, **options), clip)

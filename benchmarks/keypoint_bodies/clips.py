@@ -24,10 +24,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks._data import data_files
+from benchmarks._seeds import generator_of
 from torchpose.body import BODY_15
 from torchpose.body._skeleton import other_side
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip, read_mocap
 
 WALKS, ACTIONS, MHAD = "mocap_cmu_walk", "mocap_cmu_actions", "mocap_berkeley_mhad"
@@ -79,8 +79,12 @@ _AZIMUTHS, _JITTER = (35.0, 125.0, 215.0, 305.0), 10.0  # degrees from the front
 _DISTANCE, _CAMERA_HEIGHT, _NEAREST = (3.0, 5.0), (1.0, 2.5), 2.0  # metres
 _LONGEST_FOCAL, _MARGIN = 1500.0, 60.0  # pixels
 _PELVIS = BODY_15.joint("pelvis")
-_HIPS = [BODY_15.joint("left_hip"), BODY_15.joint("right_hip")]
 _KINECT_FOCAL = 1575.0  # pixels: three times that of an image of 640
+
+
+def pair_of(name: str) -> list[int]:
+    """Return the left and the right joint of a name, such as "hip"."""
+    return [BODY_15.joint(f"{side}_{name}") for side in ("left", "right")]
 
 
 class Faults(NamedTuple):
@@ -152,6 +156,18 @@ class Clip(NamedTuple):
         """Return the clip in the first cameras of its ring."""
         return self._replace(rig=self.rig.select(range(count)), seen=self.seen.of_cameras(count))
 
+    def without(self, joints: Sequence[int]) -> Clip:
+        """Return the clip in which no camera sees some joints."""
+        keypoints, confidence = self.seen.keypoints.clone(), self.seen.confidence.clone()
+        keypoints[..., joints, :] = math.nan
+        confidence[..., joints] = 0.0
+        return self._replace(seen=self.seen._replace(keypoints=keypoints, confidence=confidence))
+
+    @property
+    def given(self) -> tuple[CameraRig, Tensor, Tensor, float]:
+        """Return what methods get: cameras, keypoints, confidence, and frames per second."""
+        return self.rig, self.seen.keypoints, self.seen.confidence, self.fps
+
     @property
     def cameras_that_see(self) -> Int[Tensor, "T 15"]:
         """Return the number of cameras in which a keypoint is neither missing nor an outlier."""
@@ -194,7 +210,7 @@ def read_kinect(
     )  # fmt: skip
     rig, found = CameraRig([camera]), []
     for clip in recorded(data / folder, names):
-        generator = torch.Generator().manual_seed(int(settings_hash([clip.trial, seed])[:8], 16))
+        generator = generator_of(clip.trial, seed)
         joints = hips_for_pelvis(clip.joints.double())
         seen = detect(rig(joints).pixels, generator, faults)
         found.append(Clip(clip.trial, clip.fps, joints, clip.up.double(), rig, seen))
@@ -220,7 +236,7 @@ def recorded(folder: Path, names: Sequence[str], longest: int = LONGEST) -> Iter
 def hips_for_pelvis(joints: Float[Tensor, "T 15 3"]) -> Float[Tensor, "T 15 3"]:
     """Return joints with the middle of the hips as the pelvis."""
     joints = joints.clone()
-    joints[:, _PELVIS] = joints[:, _HIPS].mean(1)
+    joints[:, _PELVIS] = joints[:, pair_of("hip")].mean(1)
     return joints
 
 
@@ -231,7 +247,7 @@ def see(clip: MocapClip, seed: int = 0, faults: Faults = FAULTS, turn: float = 0
         clip: the recording. seed: of the cameras and faults. faults: of the detector. turn: of the ring,
             degrees.
     """
-    generator = torch.Generator().manual_seed(int(settings_hash([clip.trial, seed])[:8], 16))
+    generator = generator_of(clip.trial, seed)
     joints, up = clip.joints.double(), clip.up.double()
     rig = draw_ring(joints, up, generator, turn)
     pixels = rig(joints).pixels
@@ -295,9 +311,8 @@ def mean_left(joints: Float[Tensor, "T 15 3"], up: Float[Tensor, "3"]) -> Float[
     Args:
         joints: of a recording. up: of the room.
     """
-    pairs = [[BODY_15.joint(f"{side}_{joint}") for joint in ("hip", "shoulder")]
-             for side in ("left", "right")]  # fmt: skip
-    across = (joints[:, pairs[0]] - joints[:, pairs[1]]).mean((0, 1))
+    left, right = zip(pair_of("hip"), pair_of("shoulder"), strict=True)
+    across = (joints[:, left] - joints[:, right]).mean((0, 1))
     return normalize(across - (across @ up) * up, dim=-1)
 
 
@@ -402,7 +417,21 @@ def _wild(
     low = pixels.nan_to_num(math.inf).amin(2, keepdim=True)
     high = pixels.nan_to_num(-math.inf).amax(2, keepdim=True)
     anywhere = (low + high) / 2 + faults.box * (high - low) * (drawn[..., :2] - 0.5)
-    angle = 2 * math.pi * drawn[..., 2:3]
-    off = _between(faults.away, drawn[..., 3:4]) * torch.cat([angle.cos(), angle.sin()], -1)
-    wild = torch.where(drawn[..., 4:] < 0.5, anywhere, pixels + off)
-    return wild.masked_fill(pixels.isnan(), math.nan)
+    return displaced(pixels, anywhere, drawn[..., 2:], faults).masked_fill(pixels.isnan(), math.nan)
+
+
+def displaced(
+    pixels: Float[Tensor, "*batch 2"],
+    anywhere: Float[Tensor, "*batch 2"],
+    drawn: Float[Tensor, "*batch 3"],
+    faults: Faults,
+) -> Float[Tensor, "*batch 2"]:
+    """Return outliers, half of them anywhere, half off by a distance.
+
+    Args:
+        pixels: of keypoints. anywhere: where the first half is.
+        drawn: direction, distance, and which half, each from 0 to 1. faults: the distances.
+    """
+    angle = 2 * math.pi * drawn[..., :1]
+    off = _between(faults.away, drawn[..., 1:2]) * torch.cat([angle.cos(), angle.sin()], -1)
+    return torch.where(drawn[..., 2:] < 0.5, anywhere, pixels + off)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import (
     CHOOSING,
     SCORED,
@@ -23,6 +24,7 @@ from benchmarks.keypoint_bodies.clips import (
     begun,
     detect,
     draw_ring,
+    pair_of,
     read_clips,
 )
 from benchmarks.keypoint_bodies.methods import OURS, Method
@@ -30,7 +32,6 @@ from benchmarks.keypoint_bodies.scoring import Estimate
 from benchmarks.keypoint_bodies.sitting import CHOOSING_SITTERS, SCORED_SITTERS, read_sitters
 from torchpose.body import BODY_15
 from torchpose.evaluation import Report
-from torchpose.evaluation._trials import settings_hash
 from torchpose.metrics import coverage
 from torchpose.whole_body._keypoints.upright import axes_of
 
@@ -39,10 +40,7 @@ __all__ = ["add_desk_table", "desk_clips"]
 _CAMERAS, _FRAMES, _QUICK_FRAMES = 2, 60, 16
 _SITTING = "people who sit"
 _NECK = BODY_15.joint("neck")
-_SHOULDERS, _HIPS, _KNEES, _ANKLES = (
-    [BODY_15.joint(f"{side}_{name}") for side in ("left", "right")]
-    for name in ("shoulder", "hip", "knee", "ankle")
-)
+_SHOULDERS, _HIPS, _KNEES, _ANKLES = map(pair_of, ("shoulder", "hip", "knee", "ankle"))
 _LEGS = [*_KNEES, *_ANKLES]
 _HIDDEN = [BODY_15.joint("pelvis"), *_HIPS, *_LEGS]
 _COLUMNS = ("hips", "legs", "hips 90 %", "legs 90 %")
@@ -53,9 +51,7 @@ _NOTE = (
 )
 
 
-def add_desk_table(
-    report: Report, methods: Mapping[str, Method], data: Path, quick: bool = False
-) -> None:
+def add_desk_table(report: Report, methods: Mapping[str, Method], data: Path, quick: bool) -> None:
     """Add the table of people of whom nobody sees the hips.
 
     Args:
@@ -96,7 +92,7 @@ def desk_clips(data: Path, quick: bool = False, choosing: bool = False) -> dict[
     sitters = read_sitters(data, CHOOSING_SITTERS if choosing else SCORED_SITTERS, frames, quick)
     clips[_SITTING] = []
     for one in sitters:
-        generator = torch.Generator().manual_seed(int(settings_hash([one.name, 0])[:8], 16))
+        generator = generator_of(one.name, 0)
         rig = draw_ring(one.joints, one.up, generator)
         seen = detect(rig(one.joints).pixels, generator)
         clips[_SITTING].append(Clip(one.name, one.fps, one.joints, one.up, rig, seen))
@@ -112,17 +108,15 @@ def _hidden(clip: Clip) -> Clip:
     keypoints[..., _NECK, :] = keypoints[..., _SHOULDERS, :].mean(-2)
     there = keypoints[..., _NECK, :].isfinite().all(-1)
     confidence[..., _NECK] = torch.where(there, confidence[..., _SHOULDERS].mean(-1), 0.0)
-    keypoints[..., _HIDDEN, :] = math.nan
-    confidence[..., _HIDDEN] = 0.0
-    return clip._replace(seen=clip.seen._replace(keypoints=keypoints, confidence=confidence))
+    seen = clip.seen._replace(keypoints=keypoints, confidence=confidence)
+    return clip._replace(seen=seen).without(_HIDDEN)
 
 
 def _found(
     methods: Mapping[str, Method], clip: Clip, mean: Float[Tensor, "15 3"]
 ) -> dict[str, Estimate]:
     """Return what methods find, and what the mean pose and the first pose of the filter give."""
-    given = clip.rig, clip.seen.keypoints, clip.seen.confidence, clip.fps
-    found = {name: method(*given) for name, method in methods.items()}
+    found = {name: method(*clip.given) for name, method in methods.items()}
     if OURS[0] in found:
         joints = found[OURS[0]].joints
         middle, axes = _axes(joints, clip.up)

@@ -69,7 +69,7 @@ Guesser = Callable[[Tensor, Gap], list[Tensor]]
 """From tracked joints [T, 15, 3] and a gap to places of its joints [N, K, 3], of several guesses."""
 
 
-def add_hidden_table(report: Report, data: Path, quick: bool = False) -> None:
+def add_hidden_table(report: Report, data: Path, quick: bool) -> None:
     """Add the table of joints that are hidden for some frames.
 
     Args:

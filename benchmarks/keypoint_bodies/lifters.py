@@ -155,7 +155,7 @@ def load_lifters(data: Path, file: Path | None, quick: bool) -> Mapping[str, Bod
     }
 
 
-def make_examples(data: Path, quick: bool = False) -> Examples:
+def make_examples(data: Path, quick: bool) -> Examples:
     """Return the recordings from which both networks learn.
 
     Args:
@@ -193,8 +193,7 @@ def features(
 def _example(clip: Clip) -> tuple[Tensor, Tensor]:
     """Return features and targets of a clip in one camera."""
     local = (clip.joints - clip.joints[:, [_PELVIS]]) @ clip.rig.rotation[0].T
-    seen = features(clip.rig, clip.seen.keypoints, clip.seen.confidence, clip.fps)
-    return seen, (local / _TARGET).float()
+    return features(*clip.given), (local / _TARGET).float()
 
 
 def _train(net: nn.Module, name: str, examples: Examples, steps: int, seed: int = 0) -> None:

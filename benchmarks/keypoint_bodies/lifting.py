@@ -21,10 +21,10 @@ from benchmarks.keypoint_bodies.clips import (
     TRAINING,
     WALKS,
     hips_for_pelvis,
+    pair_of,
     recorded,
 )
 from benchmarks.keypoint_bodies.lifting_examples import LiftingExamples
-from torchpose.body import BODY_15
 from torchpose.io._mocap import MocapClip
 from torchpose.priors._lifting_network import (
     LiftingNetwork,
@@ -47,7 +47,7 @@ Shares = Sequence[tuple[float, Sequence[MocapClip]]]
 """Shares of the pieces, and the recordings, of sets."""
 
 
-def fit_shipped(data: Path, quick: bool = False) -> LiftingNetwork:
+def fit_shipped(data: Path, quick: bool) -> LiftingNetwork:
     """Return the network that comes with torchpose.
 
     Args:
@@ -56,7 +56,7 @@ def fit_shipped(data: Path, quick: bool = False) -> LiftingNetwork:
     return _fitted(data, _patterns(quick), _QUICK_STEPS if quick else _STEPS)
 
 
-def fit_upper_body(data: Path, quick: bool = False) -> LiftingNetwork:
+def fit_upper_body(data: Path, quick: bool) -> LiftingNetwork:
     """Return the network for upper bodies: the whole body's, fitted on to people whose hips are hidden.
 
     Args:
@@ -166,10 +166,7 @@ def _loss(network: LiftingNetwork, draw: LiftingExamples) -> Callable[[], Tensor
 
 def _legs(clips: Sequence[MocapClip]) -> float:
     """Return the mean length of thigh and shank over recordings, metres."""
-    hip, knee, ankle = (
-        [BODY_15.joint(f"{side}_{name}") for side in ("left", "right")]
-        for name in ("hip", "knee", "ankle")
-    )
+    hip, knee, ankle = map(pair_of, ("hip", "knee", "ankle"))
     lengths = [
         (x.joints[:, knee] - x.joints[:, hip]).norm(dim=-1)
         + (x.joints[:, ankle] - x.joints[:, knee]).norm(dim=-1)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import (
     HEIGHT,
     MHAD,
@@ -27,12 +28,11 @@ from benchmarks.keypoint_bodies.clips import (
     mean_left,
     recorded,
 )
-from benchmarks.keypoint_bodies.methods import CAUSAL, Method
+from benchmarks.keypoint_bodies.methods import Method, row_of
 from benchmarks.keypoint_bodies.scoring import Score, score
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.evaluation._trials import settings_hash
 from torchpose.math._rotations import rotvec_to_matrix
 
 __all__ = ["add_lying_table", "lying_clips"]
@@ -93,9 +93,7 @@ _VIEWS = {
 }
 
 
-def add_lying_table(
-    report: Report, methods: Mapping[str, Method], data: Path, quick: bool = False
-) -> None:
+def add_lying_table(report: Report, methods: Mapping[str, Method], data: Path, quick: bool) -> None:
     """Add the table of people who lie.
 
     Args:
@@ -107,16 +105,12 @@ def add_lying_table(
                          note=_NOTE)  # fmt: skip
     chosen = [Score._fields.index(column) for column in _COLUMNS]
     for name, method in tqdm(methods.items(), desc="people who lie"):
-        row = f"{name} *" if name in CAUSAL else name
         for view, clips in views.items():
-            scores = [
-                score(method(clip.rig, clip.seen.keypoints, clip.seen.confidence, clip.fps), clip)
-                for clip in clips
-            ]
-            table.add(f"{row}, {view}", torch.tensor(scores).nanmean(0)[chosen].tolist())
+            scores = [score(method(*clip.given), clip) for clip in clips]
+            table.add(f"{row_of(name)}, {view}", torch.tensor(scores).nanmean(0)[chosen].tolist())
 
 
-def lying_clips(data: Path, quick: bool = False) -> dict[str, list[Clip]]:
+def lying_clips(data: Path, quick: bool) -> dict[str, list[Clip]]:
     """Return clips of people who lie, by how they are seen.
 
     Args:
@@ -162,7 +156,7 @@ def _seen(body: _Body, view: _View, posture: str, azimuth: float) -> Clip:
     joints = joints - (joints[..., 1].nan_to_num(math.inf).min() - _JOINT) * _UP
     rig = CameraRig([_camera(view, joints)])
     name = f"{body.name}, {posture}, from {azimuth:g} degrees, {view.height:g} m"
-    generator = torch.Generator().manual_seed(int(settings_hash([name])[:8], 16))
+    generator = generator_of(name)
     return Clip(name, body.fps, joints, _UP, rig, detect(rig(joints).pixels, generator))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,11 @@ def methods_of(
         lifters = load_lifters(data, weights, quick)
     known = {**METHODS, **lifters}
     return {name: known[name] for name in chosen}
+
+
+def row_of(name: str, causal: Container[str] = CAUSAL) -> str:
+    """Return the name of a method's row, which marks those that have seen no later frame."""
+    return f"{name} *" if name in causal else name
 
 
 def takes(name: str, cameras: int) -> bool:

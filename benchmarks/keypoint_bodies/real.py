@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks.keypoint_bodies.methods import CAUSAL, Method, takes
+from benchmarks.keypoint_bodies.methods import Method, row_of, takes
 from torchpose._core.reading import read_npz
 from torchpose.body import body_joints
 from torchpose.camera import CameraRig
@@ -92,9 +92,7 @@ def predicted(method: Method, filmed: Filmed, cameras: int) -> Float[Tensor, " N
     return torch.cat(errors)
 
 
-def add_real_table(
-    report: Report, methods: Mapping[str, Method], data: Path, quick: bool = False
-) -> None:
+def add_real_table(report: Report, methods: Mapping[str, Method], data: Path, quick: bool) -> None:
     """Add the table of cameras left out.
 
     Args:
@@ -122,4 +120,4 @@ def add_real_table(
             known = errors[errors.isfinite()]
             quantiles = known.quantile(torch.tensor([0.5, 0.9], dtype=known.dtype))
             cells += [*quantiles.tolist(), 100 * float(errors.isnan().double().mean())]
-        table.add(f"{name} *" if name in CAUSAL else name, cells)
+        table.add(row_of(name), cells)

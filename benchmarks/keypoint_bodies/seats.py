@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from benchmarks.keypoint_bodies.clips import pair_of
 from torchpose.body import BODY_15
 
 __all__ = ["seated"]
@@ -22,10 +23,7 @@ _SHANK_AHEAD, _SHANK_OUT = (5.0, 20.0, 10.0), (0.0, 0.0, 6.0)
 # Degrees: means, and standard deviations of what both legs share and of what each has for itself.
 _DRIFT, _SWING, _SHARE_SWINGS = 3.0, 30.0, 0.2  # degrees over a piece, and share of the shanks
 _PELVIS = BODY_15.joint("pelvis")
-_HIPS, _KNEES, _ANKLES = (
-    [BODY_15.joint(f"{side}_{name}") for side in ("left", "right")]
-    for name in ("hip", "knee", "ankle")
-)
+_HIPS, _KNEES, _ANKLES = map(pair_of, ("hip", "knee", "ankle"))
 _TRUNK = [j for j in range(len(BODY_15.names)) if j not in {_PELVIS, *_HIPS, *_KNEES, *_ANKLES}]
 _OUT = torch.tensor([1.0, -1.0])  # to the left, of the left and the right leg
 

@@ -9,7 +9,7 @@ above, with a detector's faults; then with knees and ankles hidden.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,21 +18,22 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import (
     MHAD,
     Clip,
     aimed,
     detect,
     mean_left,
+    pair_of,
     recorded,
 )
 from benchmarks.keypoint_bodies.lifting_examples import with_arms
-from benchmarks.keypoint_bodies.methods import CAUSAL, Method
+from benchmarks.keypoint_bodies.methods import Method, row_of
 from benchmarks.keypoint_bodies.scoring import Estimate
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
 from torchpose.evaluation import Report
-from torchpose.evaluation._trials import settings_hash
 from torchpose.metrics import coverage
 
 __all__ = ["add_sitting_table", "read_sitters", "sitting_clips"]
@@ -57,10 +58,7 @@ _SOLE = 0.08  # metres, of an ankle above the floor
 _FRAMES, _QUICK_FRAMES = 60, 4
 _LEVEL = math.sin(math.radians(30.0))  # of thighs, downwards, while somebody sits
 _PELVIS = BODY_15.joint("pelvis")
-_HIPS, _KNEES, _ANKLES = (
-    [BODY_15.joint(f"{side}_{name}") for side in ("left", "right")]
-    for name in ("hip", "knee", "ankle")
-)
+_HIPS, _KNEES, _ANKLES = map(pair_of, ("hip", "knee", "ankle"))
 _HIDDEN = {"": [], ", no knees": [*_KNEES, *_ANKLES]}
 _COLUMNS = ("all", "knees", "ankles", "50 %", "90 %", "knees 50 %", "knees 90 %", "ankles 50 %",
             "ankles 90 %")  # fmt: skip
@@ -73,7 +71,7 @@ _NOTE = (
 
 
 def add_sitting_table(
-    report: Report, methods: Mapping[str, Method], data: Path, quick: bool = False
+    report: Report, methods: Mapping[str, Method], data: Path, quick: bool
 ) -> None:
     """Add the table of people who sit.
 
@@ -85,12 +83,11 @@ def add_sitting_table(
     table = report.table("sitting", "One camera, people who sit (mm)", [*_COLUMNS], digits=_DIGITS,
                          note=_NOTE)  # fmt: skip
     for name, method in tqdm(methods.items(), desc="people who sit"):
-        row = f"{name} *" if name in CAUSAL else name
         for view, clips in views.items():
             for label, hidden in _HIDDEN.items():
-                scores = [_measures(_of(method, clip, hidden), clip) for clip in clips]
+                scores = [_measures(method(*clip.without(hidden).given), clip) for clip in clips]
                 mean = torch.tensor(scores).nanmean(0).tolist()
-                table.add(f"{row}, {view}{label}", mean)
+                table.add(f"{row_of(name)}, {view}{label}", mean)
 
 
 def sitting_clips(data: Path, quick: bool = False) -> dict[str, list[Clip]]:
@@ -117,9 +114,7 @@ class Sitter(NamedTuple):
     fps: float
 
 
-def read_sitters(
-    data: Path, persons: Mapping[str, str], frames: int, quick: bool = False
-) -> list[Sitter]:
+def read_sitters(data: Path, persons: Mapping[str, str], frames: int, quick: bool) -> list[Sitter]:
     """Return people who sit.
 
     Args:
@@ -165,17 +160,9 @@ def _seen(one: Sitter, azimuth: float, height: float) -> Clip:
     camera = aimed(place, _AIM * one.up, one.up, one.joints, "camera")
     rig = CameraRig([camera])
     name = f"{one.name} from {azimuth:g} degrees, {height:g} m"
-    generator = torch.Generator().manual_seed(int(settings_hash([name])[:8], 16))
+    generator = generator_of(name)
     seen = detect(rig(one.joints).pixels, generator)
     return Clip(name, one.fps, one.joints, one.up, rig, seen)
-
-
-def _of(method: Method, clip: Clip, hidden: Sequence[int]) -> Estimate:
-    """Return what a method makes of a clip some of whose joints are not seen."""
-    keypoints, confidence = clip.seen.keypoints.clone(), clip.seen.confidence.clone()
-    keypoints[..., hidden, :] = math.nan
-    confidence[..., hidden] = 0.0
-    return method(clip.rig, keypoints, confidence, clip.fps)
 
 
 def _measures(estimate: Estimate, clip: Clip) -> list[float]:

@@ -8,7 +8,7 @@ import torch
 from tqdm.auto import tqdm
 
 from benchmarks.keypoint_bodies.clips import ACTIONS, KINECT, MHAD, OTHER_KINECT, WALKS, Clip
-from benchmarks.keypoint_bodies.methods import CAUSAL, Method, takes
+from benchmarks.keypoint_bodies.methods import Method, row_of, takes
 from benchmarks.keypoint_bodies.scoring import Score, score
 from torchpose.evaluation import Report
 
@@ -37,12 +37,8 @@ _ONE = (
 
 def score_clips(method: Method, clips: Sequence[Clip], cameras: int) -> list[Score]:
     """Return the scores of a method on clips in the first cameras of their rings."""
-    found = []
-    for whole in clips:
-        clip = whole.of_cameras(cameras)
-        seen = clip.seen
-        found.append(score(method(clip.rig, seen.keypoints, seen.confidence, clip.fps), clip))
-    return found
+    seen = [clip.of_cameras(cameras) for clip in clips]
+    return [score(method(*clip.given), clip) for clip in seen]
 
 
 def add_table(
@@ -71,5 +67,4 @@ def add_table(
         groups = [torch.tensor(score_clips(method, group, cameras)) for group in clips.values()]
         mean = Score(*torch.cat(groups).nanmean(0).tolist())
         errors = [float(group[:, Score._fields.index("error")].nanmean()) for group in groups]
-        row = f"{name} *" if name in CAUSAL else name
-        table.add(row, [*errors, *(getattr(mean, field) for field in _MEASURES.values())])
+        table.add(row_of(name), [*errors, *(getattr(mean, field) for field in _MEASURES.values())])

@@ -20,6 +20,7 @@ from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
 import torchpose
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import (
     KINECT,
     KINECT_SCORED,
@@ -30,12 +31,11 @@ from benchmarks.keypoint_bodies.clips import (
     mean_left,
     recorded,
 )
-from benchmarks.keypoint_bodies.methods import CAUSAL, Method
+from benchmarks.keypoint_bodies.methods import Method, row_of
 from benchmarks.keypoint_bodies.scoring import from_the_start
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.evaluation._trials import settings_hash
 from torchpose.metrics import align
 from torchpose.whole_body import BodyTrack
 from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_tilt
@@ -97,9 +97,7 @@ class _Seen(NamedTuple):
     camera: PinholeCamera
 
 
-def add_tilt_tables(
-    report: Report, lifters: Mapping[str, Method], data: Path, quick: bool = False
-) -> None:
+def add_tilt_tables(report: Report, lifters: Mapping[str, Method], data: Path, quick: bool) -> None:
     """Add the tables of one camera that nobody calibrated.
 
     Args:
@@ -158,7 +156,7 @@ def _levelled(joints: Tensor, up: Tensor, fps: float, quick: bool) -> Float[Tens
 
 def _seen(name: str, joints: Float[Tensor, "T 15 3"], view: _View) -> _Seen:
     """Return a person as a camera sees them."""
-    generator = torch.Generator().manual_seed(int(settings_hash([name])[:8], 16))
+    generator = generator_of(name)
     aside, away, high = torch.rand(3, generator=generator).tolist()
     azimuth = _AROUND * (2 * aside - 1)
     ray = torch.tensor([math.sin(azimuth), 0.0, math.cos(azimuth)], dtype=torch.float64)
@@ -204,8 +202,7 @@ def _errors(
         pairs = zip(tracks, people, strict=True)
         scores[name] = [_scores(_joints(track), camera, one) for (track, camera), one in pairs]
     for name, method in lifters.items():
-        row = f"{name} *, level" if name in CAUSAL else f"{name}, level"
-        scores[row] = [
+        scores[f"{row_of(name)}, level"] = [
             _scores(method(CameraRig([level]), p.keypoints, p.confidence, _FPS).joints, level, p)
             for p in people
         ]

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import Clip
 from torchpose.camera import CameraRig
-from torchpose.evaluation._trials import settings_hash
 from torchpose.math._rotations import rotvec_to_matrix
 
 FRAMES, EDGE = 80, 4
@@ -50,7 +50,7 @@ def disturb(clip: Clip, late: bool, turned: bool) -> Disturbed:
     n = min(FRAMES, len(clip.joints) - 2 * EDGE)
     rows = torch.arange(EDGE, EDGE + n)[:, None] - delays
     cameras = torch.arange(count)
-    generator = torch.Generator().manual_seed(int(settings_hash([clip.name, "cameras"])[:8], 16))
+    generator = generator_of(clip.name, "cameras")
     drawn = torch.randn(count, 2, 3, generator=generator, dtype=torch.float64)
     drawn = drawn / drawn.norm(dim=-1, keepdim=True)
     drawn[int(torch.randint(count, (), generator=generator))] = 0

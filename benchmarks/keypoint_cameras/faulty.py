@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import OTHER, WIDTH, Clip, begun
 from benchmarks.keypoint_bodies.methods import track
 from benchmarks.keypoint_bodies.peers import standing_still
@@ -16,7 +17,6 @@ from benchmarks.keypoint_bodies.triangulation import held, triangulate_subsets
 from benchmarks.keypoint_cameras.disturbed import with_poses
 from torchpose.camera import CameraRig
 from torchpose.evaluation import Report
-from torchpose.evaluation._trials import settings_hash
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.metrics import joint_errors
 
@@ -54,7 +54,7 @@ def turned(clip: Clip, degrees: float, cameras: Sequence[int] | None = None) -> 
         clip: of right cameras. degrees: of the turns. cameras: that are turned.
     """
     rig, keypoints, confidence = right(clip)
-    generator = torch.Generator().manual_seed(int(settings_hash([clip.name, "turned"])[:8], 16))
+    generator = generator_of(clip.name, "turned")
     axis = torch.randn(len(rig), 3, generator=generator, dtype=torch.float64)
     axis = torch.nn.functional.normalize(axis, dim=-1)
     if cameras is not None:

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies import clips as bodies
-from benchmarks.keypoint_bodies.clips import FAULTS, Clip, Faults, bursts, recorded
+from benchmarks.keypoint_bodies.clips import FAULTS, Clip, Faults, bursts, displaced, recorded
 from benchmarks.keypoint_feet.fit import toes_of
 from torchpose.body import BODY_15
-from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip
 
 __all__ = ["TOES", "ToedClip", "begun", "read_toed"]
@@ -73,9 +73,7 @@ def _seen(clip: MocapClip, seed: int, faults: Faults) -> ToedClip:
     """Return a recording in the ring of cameras that its name and the seed draw."""
     body, toes = bodies.see(clip, seed, faults), toes_of(clip)
     pixels = body.rig(toes).pixels
-    generator = torch.Generator().manual_seed(
-        int(settings_hash([clip.trial, seed, "toes"])[:8], 16)
-    )
+    generator = generator_of(clip.trial, seed, "toes")
     exchanged = body.seen.exchanged[:, :, _LEGS].any(-1)
     noise = torch.randn(pixels.shape, generator=generator, dtype=pixels.dtype)
     found = pixels + faults.noise * noise
@@ -100,9 +98,4 @@ def _wild(
     drawn = torch.rand(*pixels.shape[:-1], 5, generator=generator, dtype=pixels.dtype)
     low, high = pixels.amin(2, keepdim=True) - 300, pixels.amax(2, keepdim=True) + 300
     anywhere = low + (high - low) * drawn[..., :2]
-    angle = 2 * math.pi * drawn[..., 2:3]
-    nearest, farthest = faults.away
-    off = (nearest + (farthest - nearest) * drawn[..., 3:4]) * torch.cat(
-        [angle.cos(), angle.sin()], -1
-    )
-    return torch.where(drawn[..., 4:] < 0.5, anywhere, pixels + off)
+    return displaced(pixels, anywhere, drawn[..., 2:], faults)

@@ -48,7 +48,7 @@ class _Feet(NamedTuple):
     fps: float
 
 
-def fit_shipped(data: Path, quick: bool = False) -> FootPrior:
+def fit_shipped(data: Path, quick: bool) -> FootPrior:
     """Return the prior that comes with torchpose.
 
     Args:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.keypoint_bodies import peers
+from benchmarks.keypoint_bodies.clips import pair_of
 from benchmarks.keypoint_bodies.scoring import Estimate, from_the_start
 from torchpose import BodyTracker
 from torchpose.body import BODY_15
@@ -32,7 +33,7 @@ METHODS = (*_OURS, FIXED, *PEERS)
 CAUSAL = ("kalman", "kalman-legs-alone", FIXED, "pixels-filter", "standing-still")
 _N_JOINTS = len(BODY_15.names)
 _KNEES = [BODY_15.parents[ankle] for ankle in ANKLES]
-_HIPS = [BODY_15.joint(f"{side}_hip") for side in ("left", "right")]
+_HIPS = pair_of("hip")
 
 
 class FootEstimate(NamedTuple):

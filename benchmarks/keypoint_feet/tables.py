@@ -14,6 +14,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks.keypoint_bodies.clips import ACTIONS, MHAD, WALKS
+from benchmarks.keypoint_bodies.methods import row_of
 from benchmarks.keypoint_bodies.real import read_filmed, undistorted
 from benchmarks.keypoint_feet.clips import TOES, ToedClip
 from benchmarks.keypoint_feet.methods import CAUSAL, METHODS, FootEstimate, estimates_of
@@ -75,8 +76,9 @@ def add_table(report: Report, clips: Mapping[str, Sequence[ToedClip]], cameras: 
         if name in scores:
             groups = [torch.tensor(scores[name][folder]) for folder in clips]
             mean = torch.cat(groups).nanmean(0).tolist()
-            row = f"{name} *" if name in CAUSAL else name
-            table.add(row, [*(float(group[:, 0].nanmean()) for group in groups), *mean])
+            table.add(
+                row_of(name, CAUSAL), [*(float(group[:, 0].nanmean()) for group in groups), *mean]
+            )
 
 
 def _with_toes(clip: ToedClip) -> tuple[Tensor, Tensor]:
@@ -151,4 +153,4 @@ def add_real_table(report: Report, data: Path, frames: int | None = None) -> Non
             known = known[known.isfinite()]
             levels = torch.tensor([0.5, 0.9]).to(known)
             cells += known.quantile(levels).tolist() if len(known) else [torch.nan] * 2
-        result.add(f"{name} *" if name in CAUSAL else name, cells)
+        result.add(row_of(name, CAUSAL), cells)

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks._seeds import generator_of
 from benchmarks.keypoint_bodies.clips import (
     FAULTS,
     HEIGHT,
@@ -29,7 +30,6 @@ from benchmarks.keypoint_bodies.clips import (
 )
 from torchpose.body import BODY_15
 from torchpose.camera import CameraRig
-from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip
 from torchpose.math._rotations import rotvec_to_matrix
 
@@ -109,7 +109,7 @@ def let_pass(clips: Sequence[MocapClip], seed: int = 0, faults: Faults = FAULTS)
     names = [clip.trial for clip in clips]
     count = min(len(clip) for clip in clips)
     up = clips[0].up.double()
-    generator = torch.Generator().manual_seed(int(settings_hash([*names, seed])[:8], 16))
+    generator = generator_of(*names, seed)
     joints = torch.stack(
         [
             _placed(clip.joints.double()[:count], up, i, len(clips), _APART)
