@@ -145,7 +145,7 @@ def made_up_arms() -> torch.Tensor:
     return torch.cat([torch.stack([hand, elbow], 1), trunk], 1)
 
 
-def in_processes(job: Job, quick: bool = False) -> Run:
+def in_processes(job: Job, quick: bool) -> Run:
     """Call `work` in `job.size` new processes, each with cores of its own where there are enough.
 
     Args:

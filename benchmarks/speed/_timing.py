@@ -75,6 +75,11 @@ class Timing(NamedTuple):
         """Return the median CPU time of this process, over all of its threads."""
         return statistics.median(self.cpu)
 
+    @property
+    def milliseconds(self) -> list[str]:
+        """Return median and best wall time, and the median CPU time, as cells of a table."""
+        return [number(1e3 * seconds) for seconds in (self.median, self.best, self.median_cpu)]
+
 
 class Ratio(NamedTuple):
     """How many times as long the peer takes, by wall time and by CPU time."""
@@ -143,7 +148,7 @@ def ratio(peer: Timing, ours: Timing) -> Ratio:
     return Ratio(peer.median / ours.median, peer.median_cpu / max(ours.median_cpu, 1e-12))
 
 
-def measure_limits(quick: bool = False) -> Limits:
+def measure_limits(quick: bool) -> Limits:
     """Measure the rates from which floors are computed, each the best of several runs."""
     size, runs = (256, 3) if quick else (1536, 7)
     rates = []

@@ -36,7 +36,7 @@ def main(setup: Setup = Setup()) -> None:
     sizes = [Size(1000, 1000, False), Size(100, 1000, False), Size(100, 1000, True)]
     if setup.quick:
         sizes = [Size(8, 200, True)]
-    found = [in_new_process(size, setup.threads) for size in sizes]
+    found = [call_in_new_process(setup.threads, _MODULE, measure.__name__, *size) for size in sizes]
     report.table(HEADER, table_rows(sizes, found))
     worst = max(result["error"] for result in found)
     report.add(
@@ -50,12 +50,6 @@ def main(setup: Setup = Setup()) -> None:
     report.close()
     if not worst < TOLERANCE:
         sys.exit("a sequence comes out differently in a batch")
-
-
-def in_new_process(size: Size, threads: int) -> dict[str, Any]:
-    """Call `measure` in a process of its own."""
-    found: dict[str, Any] = call_in_new_process(threads, _MODULE, measure.__name__, *size)
-    return found
 
 
 def measure(batch: int, frames: int, covariances: bool) -> dict[str, Any]:

@@ -107,8 +107,7 @@ def frames(
             found = timing.case.name == "constrained"
             shares = [float(details[k].mean()) if found else math.nan for k in details]
             rows.append(
-                [timing.case.name, f"{n:,}", number(1e3 * timing.median), number(1e3 * timing.best),
-                 number(1e3 * timing.median_cpu)]
+                [timing.case.name, f"{n:,}", *timing.milliseconds]
                 + [number(share, 2) if found else "" for share in shares]
             )  # fmt: skip
     report.add(f"One frame of one camera at {WIDTH}x{HEIGHT}, D = {action.n_dimensions}:")

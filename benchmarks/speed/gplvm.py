@@ -257,11 +257,10 @@ def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, quick: bool) -> list
     timings += take_turns([whole], runs)
     found = []
     for timing in timings:
-        times = [number(1e3 * s) for s in (timing.median, timing.best, timing.median_cpu)]
         ratios = (
             ["", ""] if timing.case is whole else [number(r) for r in ratio(timing, timings[0])]
         )
-        found.append([timing.case.name, *times, *ratios])
+        found.append([timing.case.name, *timing.milliseconds, *ratios])
     return found
 
 
@@ -309,9 +308,7 @@ def prediction_rows(
     rows = []
     for method, timing, error in zip(methods, timings, errors, strict=True):
         ours = timings[0 if method.variance else 1]
-        times = (timing.median, timing.best, timing.median_cpu)
-        cells = [number(1e3 * seconds) for seconds in times]
-        cells += [number(times) for times in ratio(timing, ours)]
+        cells = [*timing.milliseconds, *map(number, ratio(timing, ours))]
         shown = [f"{e:.0e}" for e in error] + [""] * (2 - len(error))
         rows.append([method.name, f"{count:,}", *cells, *shown])
     return rows

@@ -51,8 +51,10 @@ def main(setup: Setup = Setup()) -> None:
     ways = [(*case, on) for case in cases for on in (False, True)]
     if setup.quick:  # whose peaks mean nothing
         results = [measure(*way) for way in ways]
-    else:
-        results = [in_new_process(way, setup.threads) for way in ways]
+    else:  # so that a peak is its own
+        results = [
+            call_in_new_process(setup.threads, _MODULE, measure.__name__, *way) for way in ways
+        ]
     found = list(zip(results[::2], results[1::2], strict=True))
     report.table(HEADER, table_rows(cases, found))
     moved = max(result["moved"] for _, result in found)
@@ -66,12 +68,6 @@ def main(setup: Setup = Setup()) -> None:
     report.close()
     if not (moved <= TOLERANCE and slope <= SLOPE_TOLERANCE):
         sys.exit("gradients are not those of the poses")
-
-
-def in_new_process(way: Way, threads: int) -> dict[str, Any]:
-    """Call `measure` in a new process, so that a peak is its own."""
-    found: dict[str, Any] = call_in_new_process(threads, _MODULE, measure.__name__, *way)
-    return found
 
 
 def measure(method: int, batch: int, frames: int, gradients: bool) -> dict[str, Any]:

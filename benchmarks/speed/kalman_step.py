@@ -293,9 +293,7 @@ def table_rows(
 ) -> Iterator[list[str]]:
     ours = timings[0]
     for timing, error in zip(timings, errors, strict=True):
-        times = (timing.median, timing.best, timing.median_cpu)
-        cells = [number(1e3 * seconds) for seconds in times]
-        cells += [number(times) for times in ratio(timing, ours)]
+        cells = [*timing.milliseconds, *map(number, ratio(timing, ours))]
         yield [timing.case.name, str(n_filters), *cells, *(f"{e:.0e}" for e in error)]
 
 

@@ -184,7 +184,7 @@ def add_table(
     header = (title, "median ms", "min ms", "CPU ms", "ratio", "log-evidence")
     rows = [
         (
-            t.case.name, *(number(1e3 * value) for value in (t.median, t.best, t.median_cpu)),
+            t.case.name, *t.milliseconds,
             number(t.median / timings[0].median), f"{evidence[t.case.name]:.2f}",
         )
         for t in timings

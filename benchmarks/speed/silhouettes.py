@@ -293,8 +293,7 @@ def compare(n: int, sizes: tuple[tuple[int, int], ...], runs: int, report: Repor
         for timing in timings:
             peer = ratio(timing, timings[0])
             rows.append(
-                [timing.case.name, f"{size[1]}x{size[0]}", number(1e3 * timing.median),
-                 number(1e3 * timing.best), number(1e3 * timing.median_cpu), number(peer.wall, 2),
+                [timing.case.name, f"{size[1]}x{size[0]}", *timing.milliseconds, number(peer.wall, 2),
                  number(peer.cpu, 2)]
             )  # fmt: skip
     limbs = len(BODY_15.limbs)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._command import run_command
-from benchmarks.speed._timing import Case, Setup, begin, number, take_turns
+from benchmarks.speed._timing import Case, Setup, begin, take_turns
 from torchpose.body import BODY_15
 from torchpose.math import compose, conjugate, fit_gaussian, rotate_gaussian
 from torchpose.math._tree_messages import message_tree, propagate
@@ -182,11 +182,7 @@ def timing_rows(runs: int) -> list[list[str]]:
 
             cases.append(Case(f"{directions}, {str(dtype).split('.')[1]}", call, inner=5))
     timings = take_turns(cases, runs, warm=2)
-    return [
-        [t.case.name, str(HYPOTHESES), number(1e3 * t.median), number(1e3 * t.best),
-         number(1e3 * t.median_cpu)]
-        for t in timings
-    ]  # fmt: skip
+    return [[t.case.name, str(HYPOTHESES), *t.milliseconds] for t in timings]
 
 
 if __name__ == "__main__":

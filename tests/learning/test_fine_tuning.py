@@ -14,6 +14,7 @@ from torchpose.learning._fine_tuning import (
     TunableKalman,
     TunableMixture,
     TunableWindow,
+    WindowBatch,
     draw_sequences,
     draw_windows,
     parameter_groups,
@@ -220,9 +221,16 @@ def test_what_fine_tuning_cannot_do_without(prior):
 # --- windows ----------------------------------------------------------------------------------
 
 
+def some_of(batch: WindowBatch, n: int) -> WindowBatch:
+    """About so many windows, evenly spread."""
+    step = len(batch.hands) // n
+    states = {side: value[::step] for side, value in batch.states.items()}
+    return WindowBatch(states, batch.hands[::step])
+
+
 def test_the_gradient_of_windows_is_that_of_finite_differences(prior, sources):
     model = TunableWindow(prior, "causal", error=0.0, evidence=0.1)
-    batch = draw_windows(sources, 0, n=12)
+    batch = some_of(draw_windows(sources, 0), 12)
     # a larger step: evidences of windows cancel to a slope of which 1e-5 leaves four digits
     by_gradient, by_differences = directional(model, lambda: model.loss(batch, noise()), step=1e-4)
     assert by_gradient == pytest.approx(by_differences, rel=3e-4, abs=1e-7)
@@ -231,7 +239,7 @@ def test_the_gradient_of_windows_is_that_of_finite_differences(prior, sources):
 def test_the_error_over_windows_falls(prior, sources):
     model = TunableWindow(prior, "causal", evidence=0.01)
     adam = torch.optim.Adam(model.parameters(), lr=0.01)
-    batch = draw_windows(sources, 0, n=300)
+    batch = some_of(draw_windows(sources, 0), 300)
     before, generator = float(model.error(batch, noise())), noise(1)
     for _ in range(25):
         adam.zero_grad()

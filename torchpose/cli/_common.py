@@ -57,7 +57,7 @@ def share_cores() -> None:
 
 
 def pictures_possible(wanted: bool) -> bool:
-    """Return whether pictures are wanted and can be drawn; explain on stderr if they cannot."""
+    """Return whether pictures are wanted and can be drawn; say so if they cannot."""
     if wanted and find_spec("matplotlib") is None:
         print(
             "no pictures: matplotlib is not installed; `python -m pip install matplotlib` brings it"

@@ -274,11 +274,16 @@ def _run_on_keypoints(
     outlines = None
     if values["silhouettes"]:
         outlines = SilhouetteSettings(values["rows"], values["background"], values["ignore_still"])
+    as_given = ("smoothing", "videos", "fps", "delays", "refine", "persons", "initial_pose", "seed")
     settings = KeypointSettings(
-        detector, values["smoothing"], values["videos"], values["fps"], values["delays"], arguments,
-        values["refine"], values["persons"], values["method"] or KALMAN,
-        values["initial_pose"], values["seed"], outlines, needs_no_file(values["cameras"]), finds_tilt,
-    )  # fmt: skip
+        detector=detector,
+        tracker=arguments,
+        method=values["method"] or KALMAN,
+        silhouettes=outlines,
+        without_file=needs_no_file(values["cameras"]),
+        finds_tilt=finds_tilt,
+        **{name: values[name] for name in as_given},
+    )
     return track_keypoints(job, inputs, cameras, settings)
 
 

@@ -81,14 +81,14 @@ class KeypointSettings(NamedTuple):
     fps: float | None
     delays: list[int] | None
     tracker: dict[str, Any]
-    refine: str = "none"
-    persons: str | int | None = None
-    method: str = KALMAN
-    initial_pose: str | None = None
-    seed: int = 0
-    silhouettes: SilhouetteSettings | None = None
-    without_file: bool = False
-    finds_tilt: bool = False
+    refine: str
+    persons: str | int | None
+    method: str
+    initial_pose: str | None
+    seed: int
+    silhouettes: SilhouetteSettings | None
+    without_file: bool
+    finds_tilt: bool
 
 
 def track_keypoints(

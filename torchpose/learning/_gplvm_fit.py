@@ -118,7 +118,6 @@ class GPLVMFit(nn.Module):
         optimiser: "lbfgs" (with line search) or "adam". learning_rate: None for the optimiser's own.
         smoothness: weight of a penalty 1/2 sum_i a_i^T K_x a_i, which takes each g_i for a draw from a
             Gaussian process; 0 is the published form.
-        free_gamma_z: optimise gamma_z too, as printed; Z then shrinks for as long as the fit goes on.
         start: which principal components to start from, see `principal_start`.
 
     Raises:
@@ -142,7 +141,6 @@ class GPLVMFit(nn.Module):
         optimiser: str = "lbfgs",
         learning_rate: float | None = None,
         smoothness: float = 0.0,
-        free_gamma_z: bool = False,
         start: int = 0,
     ) -> None:
         super().__init__()
@@ -167,7 +165,7 @@ class GPLVMFit(nn.Module):
         logs = torch.tensor([math.log(value) for value in sizes], dtype=torch.float64)
         logs[3] /= 2
         self.log_kernel = nn.Parameter(logs.to(poses.device))
-        self._smoothness, self._free_gamma_z = smoothness, free_gamma_z
+        self._smoothness = smoothness
         self.history: list[float] = []
         self.scores: list[float] = []
         self._best: dict[str, Tensor] = {}
@@ -177,7 +175,7 @@ class GPLVMFit(nn.Module):
     def kernel(self) -> KernelParameters:
         """Return beta, beta_0, gamma_z and sigma_z."""
         beta, beta0, gamma, sigma = self.log_kernel.unbind()
-        return KernelParameters(beta, beta0, gamma if self._free_gamma_z else gamma.detach(), sigma)
+        return KernelParameters(beta, beta0, gamma.detach(), sigma)
 
     @property
     def weights(self) -> Float[Tensor, "T d"]:

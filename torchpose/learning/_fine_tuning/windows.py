@@ -42,14 +42,11 @@ class WindowBatch(NamedTuple):
     hands: Bool[Tensor, "N H"]
 
 
-def draw_windows(
-    sources: Mapping[str, WindowSource], index: int, epoch: int = 0, n: int | None = None
-) -> WindowBatch:
+def draw_windows(sources: Mapping[str, WindowSource], index: int, epoch: int = 0) -> WindowBatch:
     """Draw the windows of a block, with those of their hands known that a tracker would have seen.
 
     Args:
         sources: of the left and right arm, from the same seed. index, epoch: of the block.
-        n: number of windows to take, about, evenly spread; all if None.
 
     Raises:
         InputError: sources of different windows.
@@ -61,8 +58,7 @@ def draw_windows(
     layout, frames, centres = left.layout, left.frames, left.centres_of(index)
     wanted = frames.wanted(centres, (*layout.own, *layout.other), layout.fps)
     hands = (wanted >= frames.first[centres, None]) & (wanted <= frames.last[centres, None])
-    step = 1 if n is None else max(1, len(hands) // n)
-    return WindowBatch({side: value[::step] for side, value in states.items()}, hands[::step])
+    return WindowBatch(states, hands)
 
 
 class TunableWindow(nn.Module):
