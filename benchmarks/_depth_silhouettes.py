@@ -11,12 +11,13 @@ from torch import Tensor
 from benchmarks._data import data_files
 from benchmarks.bodies.tracking import PARTS
 from torchpose._core.files import atomic_path, check_output_folder
-from torchpose.body import BODY_15, Body, body_joints
+from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.evaluation import Report
 from torchpose.metrics import joint_errors
 from torchpose.video._overlay import draw_body
 from torchpose.whole_body import render
+from torchpose.whole_body._silhouettes.shape import fit_radii
 
 _ENLARGED = 2  # pixels of the picture for one of a silhouette
 HEAD_TOP = 0.11
@@ -90,6 +91,14 @@ def kinect(folder: Path, person: str, action: str, trials: str) -> Iterator[Tens
     for path in data_files(folder / "kinect_utd_mhad", pattern):
         with np.load(path) as z:
             yield body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
+
+
+def fit_to_view(trials: Sequence[Tensor], other: Filmed) -> Body:
+    """Return the body of a person: bone lengths of trials, radii of some silhouettes of another action."""
+    body = fit_body(torch.cat(list(trials)), head_top=HEAD_TOP)
+    rows = torch.linspace(0, len(other.joints) - 1, 6).round().long()
+    states = fit_state(body, other.joints[rows])
+    return fit_radii(body, states, other.silhouettes[rows], other.rig, seed=0)
 
 
 def one_view(folder: Path, person: str, action: str) -> Filmed:

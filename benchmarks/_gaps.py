@@ -149,39 +149,54 @@ def _one_gap(
 ) -> tuple[list[float], list[float], Tensor]:
     """Return the numbers of both tables, and errors over time [T, 8], mirrored so that the left is hidden."""
     first = round(_START * test.fps)
-    last = first + round(seconds * test.fps)
+    gap = slice(first, first + round(seconds * test.fps))
     mask = torch.ones(test.keypoints.shape[:3], dtype=torch.bool)
-    mask[:, first:last, MEASURED.index(f"hand_{side}")] = False
+    mask[:, gap, MEASURED.index(f"hand_{side}")] = False
     hidden = {frame: track(prior, CAMERA, test, mask, frame=frame, **options) for frame in whole}
-    arm = list(_ARMS[side])
-    other = list(_ARMS["right" if side == "left" else "left"][:3])
-    estimate = hidden["camera"]
-    errors = 100 * joint_errors_3d(estimate.joints3d, test.truth3d)
-    aligned = align(estimate.joints3d, test.truth3d, covariance=estimate.covariance3d)
-    turned: Any = aligned.covariance
-    during = slice(first, last)
-    held = coverage(aligned.points[:, during], turned[:, during], test.truth3d[:, during])
+    errors = 100 * joint_errors_3d(hidden["camera"].joints3d, test.truth3d)
+    over_time = errors.nanmean(0)
+    if side == "right":
+        over_time = over_time[:, list(OTHER_SIDE)]
+    return (
+        _errors_about(gap, hidden["camera"], errors, test, side),
+        _changes(gap, hidden, whole, round(test.fps), side),
+        over_time,
+    )
+
+
+def _errors_about(
+    gap: slice, estimate: Estimate, errors: Float[Tensor, "B T 8"], test: Trials, side: str
+) -> list[float]:
+    """Return errors of hand and elbow before, in and after a gap, and the shares in ellipsoids."""
+    hand, elbow = _ARMS[side][:2]
     second = round(test.fps)
-    hand, elbow = arm[0], arm[1]
-    after = errors[:, last : last + second]
+    after = errors[:, gap.stop : gap.stop + second]
     values = [
-        errors[:, first - second : first, hand], errors[:, during, hand], errors[:, during, elbow],
+        errors[:, gap.start - second : gap.start, hand], errors[:, gap, hand], errors[:, gap, elbow],
         after[..., hand], after[..., elbow],
     ]  # fmt: skip
+    aligned = align(estimate.joints3d, test.truth3d, covariance=estimate.covariance3d)
+    turned: Any = aligned.covariance
+    held = coverage(aligned.points[:, gap], turned[:, gap], test.truth3d[:, gap])
     shares = [100 * held.per_joint[level, joint] for joint in (hand, elbow) for level in (0, 1)]
-    means = [float(v.nanmean()) for v in values] + [float(s) for s in shares]
-    edges = [first, last]
+    return [float(v.nanmean()) for v in values] + [float(s) for s in shares]
+
+
+def _changes(
+    gap: slice, hidden: dict[str, Estimate], whole: dict[str, Estimate], second: int, side: str
+) -> list[float]:
+    """Return how steps of both arms change where a gap begins and ends, and a step without it, cm."""
+    other = list(_ARMS["right" if side == "left" else "left"][:3])
+    edges = [gap.start, gap.stop]
     changes = []
     for frame in ("body", "camera"):
         each = _jump(hidden[frame], whole[frame], other, edges)
         changes += [float(each.max()), float(each.median())]
+    hand = _ARMS[side][0]
     changes.append(float(_jump(hidden["camera"], whole["camera"], [hand], edges).median()))
     steps = whole["camera"].joints3d[:, second:, other].diff(dim=1).norm(dim=-1)
     changes.append(100 * float(steps.amax(-1).median()))
-    over_time = errors.nanmean(0)
-    if side == "right":
-        over_time = over_time[:, list(OTHER_SIDE)]
-    return means, changes, over_time
+    return changes
 
 
 def _jump(

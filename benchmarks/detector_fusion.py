@@ -129,9 +129,7 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    clips = read_clips(data)
-    if quick:
-        clips = [clip for clip in clips if clip.name == "akstheme_gesture"]
+    clips = read_clips(data, ("akstheme_gesture",) if quick else ())
     report = Report("Hands of a detector and own hands")
     digits = (0,) * len(_COLUMNS)
     table = report.table("hands", "Hands that are right, by clip", list(_COLUMNS), digits=digits)

@@ -21,7 +21,16 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
-from benchmarks._depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
+from benchmarks._depth_silhouettes import (
+    HEAD_TOP,
+    PELVIS,
+    Filmed,
+    draw,
+    fit_to_view,
+    kinect,
+    one_view,
+    seeded,
+)
 from benchmarks._table_file import save_text
 from benchmarks.bend.variants import REDRAWS, SHARPNESS, fit_space
 from benchmarks.engine import Setting, choose_setting
@@ -32,7 +41,6 @@ from torchpose.evaluation import Report
 from torchpose.priors import ActionSpace, state_postures
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std, count_pixels
 from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
-from torchpose.whole_body._silhouettes.shape import fit_radii
 
 ACTION, FPS = "pickup_throw", 30.0
 TEST, TUNING, OTHERS = ("s02", "s04", "s06"), "s08", ("s01", "s03", "s05", "s07")
@@ -72,12 +80,8 @@ def prepare(folder: Path, person: str) -> Person:
         tuple(fit_state(body.altered(centres=centres), trial) for trial in trained[p])
         for p, body in plain.items()
     ]
-    body = fit_body(torch.cat(list(kinect(folder, person, ACTION, "234"))), head_top=HEAD_TOP)
-    other = one_view(folder, person, "squat")
-    rows = torch.linspace(0, len(other.joints) - 1, 6).round().long()
-    states = fit_state(body, other.joints[rows])
-    body = fit_radii(body, states, other.silhouettes[rows], other.rig, seed=0)
-    body = body.altered(centres=centres)
+    own = list(kinect(folder, person, ACTION, "234"))
+    body = fit_to_view(own, one_view(folder, person, "squat")).altered(centres=centres)
     data = one_view(folder, person, ACTION)
     std = constant_velocity_std(body, [states for one in moved for states in one], floor=1e-3)
     return Person(

@@ -25,9 +25,9 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import (
-    HEAD_TOP,
     Filmed,
     draw,
+    fit_to_view,
     kinect,
     mean_of,
     one_view,
@@ -54,7 +54,6 @@ from torchpose.whole_body import (
     find_pose,
     motion_std,
 )
-from torchpose.whole_body._silhouettes.shape import fit_radii
 
 ROWS = 160
 HEIGHT = 1.75  # metres, of the man in the four views: nobody wrote it down
@@ -164,11 +163,7 @@ class Person(NamedTuple):
 def prepare(folder: Path, person: str, action: str) -> Person:
     """Fit bone lengths to trials 2 to 4, radii to another action's silhouettes, and a manifold to others."""
     own = list(kinect(folder, person, action, "234"))
-    body = fit_body(torch.cat(own), head_top=HEAD_TOP)
-    other = one_view(folder, person, "clap" if action != "clap" else "wave")
-    rows = torch.linspace(0, len(other.joints) - 1, 6).round().long()
-    states = fit_state(body, other.joints[rows])
-    body = fit_radii(body, states, other.silhouettes[rows], other.rig, seed=0)
+    body = fit_to_view(own, one_view(folder, person, "clap" if action != "clap" else "wave"))
     poses = [
         body.relative(fit_state(body, joints))
         for p in OTHERS

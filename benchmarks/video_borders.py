@@ -243,9 +243,7 @@ def main(
         quick: one clip, to see that it works.
     """
     torch.set_num_threads(threads)
-    clips = read_clips(data)
-    if quick:
-        clips = [clip for clip in clips if clip.name == "akstheme_gesture"]
+    clips = read_clips(data, ("akstheme_gesture",) if quick else ())
     fitted = load_prior(prior)
     report = Report("Hands beyond the borders of the image")
     titles = {

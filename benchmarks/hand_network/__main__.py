@@ -198,12 +198,11 @@ def main(
     """
     torch.set_num_threads(threads)
     check_output_folder(out)
-    clips = read_clips(data)
+    clips = read_clips(data, ("akstheme_gesture", "milk") if quick else ())
     rendered = render_clips(out)
     steps = STEPS
     if quick:
-        chosen = ("akstheme_gesture", "milk")
-        clips, rendered, steps = [c for c in clips if c.name in chosen], rendered[:1], _QUICK_STEPS
+        rendered, steps = rendered[:1], _QUICK_STEPS
     labelled = [*clips, *rendered]
     if fit is not None:
         command = (

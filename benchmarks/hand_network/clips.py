@@ -126,15 +126,17 @@ class _Recorder(HandNetwork):
         return HandPlaces(even, sure, even, sure)
 
 
-def read_clips(data: Path) -> list[Clip]:
+def read_clips(data: Path, only: Sequence[str] = ()) -> list[Clip]:
     """Return the clips of signers and of other people.
 
     Args:
-        data: folder with video_asl/ and video_people/.
+        data: folder with video_asl/ and video_people/. only: names of clips; all if there are none.
     """
     clips = []
     for folder, persons in (("video_people", PEOPLE), ("video_asl", SIGNERS)):
         for name, person in persons.items():
+            if only and name not in only:
+                continue
             (path, *_) = data_files(data / folder, f"{name}.m*")
             labels = _by_mediapipe(data / folder / f"{name}_mediapipe_pose1.npz", path)
             clips.append(Clip(name, person, path, labels))
