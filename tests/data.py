@@ -18,6 +18,12 @@ def data_dir_or_skip(name: str) -> Path:
     return folder
 
 
+def data_with(*names: str) -> Path:
+    """The folder of all data sets, or a skip if one of these is missing."""
+    *_, last = map(data_dir_or_skip, names)
+    return last.parent
+
+
 def few_recordings(name: str, into: Path, per_person: int, chosen: tuple[str, ...] = ()) -> Path:
     """A folder with links to evenly spread recordings of each person: to read all takes seconds.
 

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from benchmarks.bones import errors, lifted, mhad_views, openpose_views, true_lengths
-from tests.data import data_dir_or_skip, few_recordings
+from tests.data import data_with, few_recordings
 
 
 @pytest.fixture(scope="module")
 def data():
-    return data_dir_or_skip("mocap_berkeley_mhad").parent
+    return data_with("mocap_berkeley_mhad")
 
 
 def test_views_are_projections_of_their_truth(data):

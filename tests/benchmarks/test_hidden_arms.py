@@ -5,7 +5,7 @@ import torch
 
 from benchmarks import bones
 from benchmarks.hidden_arms import KINDS, filled, hidden
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 
 NAMES = ("wrist_left", "elbow_left", "neck", "wrist_right", "elbow_right")
 
@@ -40,7 +40,7 @@ def test_the_simplest_ways_stay_or_go_straight_on():
 
 @pytest.mark.slow
 def test_a_quick_run_prints_a_row_for_each_kind_of_gap(run_here, tmp_path):
-    data = data_dir_or_skip("mocap_berkeley_mhad").parent
+    data = data_with("mocap_berkeley_mhad")
     printed = run_here("hidden_arms", "--quick", "--data", str(data), "--out", str(tmp_path))
     for kind in KINDS:
         assert f"| s9 to s12 of Berkeley MHAD: {kind} |" in printed

@@ -40,7 +40,7 @@ from benchmarks.keypoint_bodies.triangulation import (
     triangulate_subsets,
     without_outliers,
 )
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 from torchpose.body import BODY_15
 from torchpose.demo._rendering.walk import walk, walk_clip
 from torchpose.evaluation import Report
@@ -176,7 +176,7 @@ def test_a_lifted_body_is_put_where_its_keypoints_are(clean):
 
 
 def test_persons_of_a_kinect_stand_before_it_with_their_left_at_the_right():
-    data = data_dir_or_skip(KINECT).parent
+    data = data_with(KINECT)
     (clip,) = read_kinect(data, KINECT_SCORED[:1], faults=CLEAN)
     pixels = clip.seen.keypoints[:, 0]
     left, right, head, hip = (
@@ -188,16 +188,14 @@ def test_persons_of_a_kinect_stand_before_it_with_their_left_at_the_right():
 
 
 def test_a_real_camera_is_predicted_from_the_others():
-    filmed = read_filmed(data_dir_or_skip("multicam_pose2sim").parent)
+    filmed = read_filmed(data_with("multicam_pose2sim"))
     errors = predicted(METHODS["pose2sim"], filmed, 3)
     assert 5 < float(errors.nanmedian()) < 30
 
 
 @pytest.mark.slow
 def test_quick_run_prints_every_peer(run_here, tmp_path):
-    data = data_dir_or_skip("mocap_cmu_walk").parent
-    for name in (ACTIONS, KINECT, OTHER_KINECT, MHAD, "multicam_pose2sim"):
-        data_dir_or_skip(name)
+    data = data_with("mocap_cmu_walk", ACTIONS, KINECT, OTHER_KINECT, MHAD, "multicam_pose2sim")
     weights = tmp_path / "lifters.safetensors"
     names = [*PEERS, "gru", "mlp", "mean-pose"]
     options = ("--data", str(data), "--out", str(tmp_path), "--lifters", str(weights))
@@ -210,54 +208,49 @@ def test_quick_run_prints_every_peer(run_here, tmp_path):
     assert (tmp_path / "keypoint_bodies.md").read_text().split() == printed.split()
 
 
-def test_quick_run_prints_people_who_sit(run_here):
-    data = data_dir_or_skip(MHAD).parent
-    for name in (WALKS, ACTIONS):
-        data_dir_or_skip(name)
-    options = ("--data", str(data), "--quick", "--sitting", "--methods", "kalman", "pose2sim")
-    printed = run_here("keypoint_bodies.__main__", *options)
+@pytest.fixture
+def quick(run_here):
+    """What a quick run prints with some options: quick("--desk", ...)."""
+
+    def run(*options):
+        data = str(data_with(MHAD, WALKS, ACTIONS, KINECT))
+        return run_here("keypoint_bodies.__main__", "--data", data, "--quick", *options)
+
+    return run
+
+
+def test_quick_run_prints_people_who_sit(quick):
+    printed = quick("--sitting", "--methods", "kalman", "pose2sim")
     for row in ("front", "oblique", "side"):
         assert f"| kalman *, {row} |" in printed and f"| kalman *, {row}, no knees |" in printed
     assert "pose2sim" not in printed  # takes several cameras
 
 
-def test_quick_run_prints_people_who_lie(run_here):
-    data = data_dir_or_skip(MHAD).parent
-    printed = run_here(
-        "keypoint_bodies.__main__", "--data", str(data), "--quick", "--lying", "--methods", "kalman"
-    )
+def test_quick_run_prints_people_who_lie(quick):
+    printed = quick("--lying", "--methods", "kalman")
     for row in ("lying, across", "upside down", "camera on its side", "standing, level camera"):
         assert f"| kalman *, {row} |" in printed
 
 
 @pytest.mark.slow
-def test_quick_run_prints_cameras_that_are_tilted(run_here):
-    data = data_dir_or_skip(MHAD).parent
-    options = ("--data", str(data), "--quick", "--uncalibrated", "--methods", "kalman")
-    printed = run_here("keypoint_bodies.__main__", *options)
+def test_quick_run_prints_cameras_that_are_tilted(quick):
+    printed = quick("--uncalibrated", "--methods", "kalman")
     for row in ("level", "told", "found"):
         assert printed.count(f"| kalman *, {row} |") == 6
     assert "Tilt found, persons of a Kinect" in printed
 
 
 @pytest.mark.slow
-def test_quick_run_prints_people_behind_a_desk(run_here):
-    data = data_dir_or_skip(MHAD).parent
-    for name in (WALKS, ACTIONS):
-        data_dir_or_skip(name)
-    options = ("--data", str(data), "--quick", "--desk", "--methods", "kalman", "pose2sim")
-    printed = run_here("keypoint_bodies.__main__", *options)
+def test_quick_run_prints_people_behind_a_desk(quick):
+    printed = quick("--desk", "--methods", "kalman", "pose2sim")
     for row in ("kalman", "mean pose", "still"):
         assert f"| {row}, {WALKS} |" in printed and f"| {row}, all |" in printed
     assert "pose2sim" not in printed  # knows nothing of joints that no camera sees
 
 
 @pytest.mark.slow
-def test_quick_run_prints_joints_that_are_hidden(run_here):
-    data = data_dir_or_skip(MHAD).parent
-    for name in (WALKS, ACTIONS):
-        data_dir_or_skip(name)
-    printed = run_here("keypoint_bodies.__main__", "--data", str(data), "--quick", "--hidden")
+def test_quick_run_prints_joints_that_are_hidden(quick):
+    printed = quick("--hidden")
     for row in ("seen", "hand, 6 frames", "everything, 6 frames"):
         assert f"| 2 cameras, {row} |" in printed
 
@@ -296,8 +289,7 @@ def test_turned_rings_see_the_same_body_from_other_sides(walker):
 
 @pytest.mark.slow
 def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_size(tmp_path):
-    data = data_dir_or_skip(WALKS).parent
-    data_dir_or_skip(KINECT)
+    data = data_with(WALKS, KINECT)
     fit_shipped(data, quick=True).save(tmp_path / "lifting.safetensors")
     network = LiftingNetwork.load(tmp_path / "lifting.safetensors")
     assert network.info.recordings == ("mocap_cmu_walk/s02_*", "kinect_utd_mhad/s01_*")
@@ -305,8 +297,7 @@ def test_the_network_that_lifts_is_fitted_to_those_who_train_and_knows_their_siz
 
 
 def test_the_network_of_upper_bodies_goes_on_from_that_of_whole_bodies():
-    data = data_dir_or_skip(WALKS).parent
-    data_dir_or_skip(KINECT)
+    data = data_with(WALKS, KINECT)
     fitted, whole = fit_upper_body(data, quick=True), shipped_lifting_network()
     assert (fitted.info.name, whole.info.name) == ("upper-body", "whole-body")
     change = (fitted.places.weight - whole.places.weight).abs().max()

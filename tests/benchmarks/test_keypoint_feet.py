@@ -10,7 +10,7 @@ from benchmarks.keypoint_feet.clips import begun, read_toed
 from benchmarks.keypoint_feet.fit import fit_shipped
 from benchmarks.keypoint_feet.methods import FIXED, PEERS, estimates_of
 from benchmarks.keypoint_feet.tables import _with_toes
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 from torchpose.body import BODY_15
 from torchpose.body._feet import ANKLES, FEET
 from torchpose.priors._foot_prior import FootPrior, shipped_foot_prior
@@ -22,14 +22,14 @@ TOES = [FEET.index(f"{side}_big_toe") for side in ("left", "right")]
 
 @pytest.fixture(scope="module")
 def walk():
-    data = data_dir_or_skip("mocap_cmu_walk").parent
+    data = data_with("mocap_cmu_walk")
     (clip,) = read_toed(data, {WALKS: CHOOSING[WALKS][:1]})[WALKS]
     return begun(clip, 12)
 
 
 @pytest.mark.data
 def test_the_fifteen_joints_are_seen_as_without_toes(walk):
-    data = data_dir_or_skip("mocap_cmu_walk").parent
+    data = data_with("mocap_cmu_walk")
     (clip,) = bodies.read_clips(data, {WALKS: CHOOSING[WALKS][:1]})[WALKS]
     alone = bodies.begun(clip, 12)
     assert_close(walk.body.seen.keypoints, alone.seen.keypoints, equal_nan=True)
@@ -38,7 +38,7 @@ def test_the_fifteen_joints_are_seen_as_without_toes(walk):
 
 @pytest.mark.data
 def test_toes_without_faults_are_where_cameras_see_them():
-    data = data_dir_or_skip("mocap_cmu_walk").parent
+    data = data_with("mocap_cmu_walk")
     (clip,) = read_toed(data, {WALKS: CHOOSING[WALKS][:1]}, faults=CLEAN)[WALKS]
     clip = begun(clip, 5)
     pixels = clip.body.rig(clip.toes).pixels
@@ -69,9 +69,7 @@ def test_tracked_toes_are_nearer_than_those_of_a_fixed_foot(walk):
 @pytest.mark.slow
 @pytest.mark.data
 def test_the_prior_over_feet_is_fitted_and_read_back(tmp_path):
-    data = data_dir_or_skip("mocap_cmu_walk").parent
-    for name in (ACTIONS, MHAD):
-        data_dir_or_skip(name)
+    data = data_with("mocap_cmu_walk", ACTIONS, MHAD)
     path = tmp_path / "feet.safetensors"
     fit_shipped(data, quick=True).save(path)
     prior = FootPrior.load(path)
@@ -91,9 +89,7 @@ def test_nobody_who_is_scored_is_in_the_prior():
 @pytest.mark.data
 @pytest.mark.slow
 def test_quick_run_prints_every_method(run_here, tmp_path):
-    data = data_dir_or_skip("mocap_cmu_walk").parent
-    for name in (ACTIONS, MHAD, "multicam_pose2sim"):
-        data_dir_or_skip(name)
+    data = data_with("mocap_cmu_walk", ACTIONS, MHAD, "multicam_pose2sim")
     options = ("--data", str(data), "--out", str(tmp_path), "--threads", "1")
     printed = run_here("keypoint_feet.__main__", "--quick", *options)
     assert printed.count("| fixed-foot * |") == 3

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from benchmarks._lifters import FEW, LIFTERS, fit_lifter
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 from tests.upper_body.test_articulated import body
 from torchpose.priors._arms import shipped_arm_prior
 
@@ -62,7 +62,7 @@ def test_the_nearest_neighbour_is_somebody(lifters):
 
 
 def test_a_quick_run_prints_both_tables(run_here, tmp_path):
-    data = data_dir_or_skip("mocap_berkeley_mhad").parent
+    data = data_with("mocap_berkeley_mhad")
     printed = run_here("unseen_sets", "--quick", "--data", str(data), "--out", str(tmp_path))
     for row in ("multiple-model", *LIFTERS, "hanging arms"):
         assert printed.count(f"| {row} |") == 2

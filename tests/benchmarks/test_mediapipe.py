@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import mediapipe_landmarks
 from tests.benchmarks.conftest import ROOT
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 
 
 def rows(text: str, title: str) -> dict[str, list[str]]:
@@ -22,7 +22,7 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
 @pytest.mark.slow
 def test_landmarks_as_the_front_end(run_here, tmp_path):
     written = tmp_path / "table.md"
-    data = data_dir_or_skip("video_asl").parent
+    data = data_with("video_asl")
     options = ("--data", str(data), "--out", str(written), "--prior", "kinect-upper-body-small")
     run_here("mediapipe_front_end", "--quick", *options)
     text = written.read_text()
@@ -38,7 +38,7 @@ def test_landmarks_as_the_front_end(run_here, tmp_path):
 @pytest.mark.slow
 def test_joints_from_video(run_here, tmp_path):
     written, pictures = tmp_path / "joints.md", tmp_path / "joints"
-    data = data_dir_or_skip("video_asl").parent
+    data = data_with("video_asl")
     options = ("--data", str(data), "--out", str(written), "--pictures", str(pictures))
     run_here("video_asl_joints", "--quick", "--prior", "kinect-upper-body-small", *options)
     text = written.read_text()

@@ -7,12 +7,12 @@ import torch
 
 from benchmarks import bones
 from benchmarks.tilted_cameras import told_view
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 
 
 @pytest.fixture(scope="module")
 def data():
-    return data_dir_or_skip("mocap_berkeley_mhad").parent
+    return data_with("mocap_berkeley_mhad")
 
 
 def test_a_tilted_view_is_the_level_one_turned_about_the_neck(data):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from benchmarks.unseen_levels import LEVELS, METHODS, add_table
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 from torchpose.evaluation import Report
 
 
@@ -38,7 +38,7 @@ def test_a_factor_of_a_recording_is_told_and_taken_out():
 
 
 def test_a_quick_run_prints_a_table_for_each_method(run_here, tmp_path):
-    data = data_dir_or_skip("mocap_berkeley_mhad").parent
+    data = data_with("mocap_berkeley_mhad")
     printed = run_here("unseen_levels", "--quick", "--data", str(data), "--out", str(tmp_path))
     for method in METHODS:
         for measured in ("all joints", "neck, hands and head"):

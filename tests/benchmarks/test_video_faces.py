@@ -7,7 +7,7 @@ pytest.importorskip("cv2")
 pytest.importorskip("matplotlib")
 
 from benchmarks.video_faces import Frame, large, lit, small, smaller, turned
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 
 
 def dot():
@@ -40,7 +40,7 @@ def test_large_frames_are_made_smaller_as_the_measurer_does():
 
 
 def test_a_quick_run_finds_the_person(run_here):
-    folder = data_dir_or_skip("video_asl").parent
+    folder = data_with("video_asl")
     printed = run_here("video_faces", "--quick", "--data", str(folder), "--only", "none")
     row = next(line.split() for line in printed.splitlines() if line.startswith("none"))
     assert float(row[1]) > 0.8 and float(row[3]) == 0

@@ -13,6 +13,7 @@ import torch
 from tests.full_disk import files_up_to
 from tests.priors.motions import motion
 from tests.priors.performances import performances
+from tests.recorded_bodies import write_body
 from torchpose._core.tensor_file import format_of
 from torchpose.body import BODY_15, Body
 from torchpose.cli._fit_bodies import KINDS, command, recorded_command
@@ -64,9 +65,8 @@ def walks(tmp_path_factory) -> Path:
             )
             state = torch.zeros(80, body.dim, dtype=torch.float64)
             state[:, 1] = 0.9
-            write(
-                folder, f"p{person}", trial, body, body.with_relative(state, poses), 120.0, "walk"
-            )
+            joints = body.joints(body.with_relative(state, poses))
+            write_body(folder / f"p{person}_{trial}.npz", joints, 120.0, f"p{person}", "walk")
     return folder
 
 
@@ -83,15 +83,9 @@ def exercises(tmp_path_factory) -> Path:
             angles = rest + 0.4 * (torch.cat(parts) - parts[0].mean(0))
             states = posture_to_state(body, angles.clamp(-80, 80), at_rest)
             states[:, 1] += 0.9
-            write(folder, f"p{person}", action, body, states, 30.0, f"action{action}")
+            path = folder / f"p{person}_{action}.npz"
+            write_body(path, body.joints(states), 30.0, f"p{person}", f"action{action}")
     return folder
-
-
-def write(folder, person, number, body, states, fps, action):
-    np.savez(
-        folder / f"{person}_{number}.npz", joints=body.joints(states).numpy(), fps=fps, action=action,
-        names=np.array(BODY_15.names), subject=person, source="set", axes="y-up",
-    )  # fmt: skip
 
 
 def tensors_and_facts(kind, path):

@@ -3,7 +3,6 @@
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,6 +11,7 @@ from torchpose.learning import fit_action_space
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.performances import performances
+from tests.recorded_bodies import write_body
 from tests.train.scenes import check_refusals, make_hole, rewrite, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._recipes import Performances
@@ -19,7 +19,7 @@ from torchpose.priors import ActionBank, ActionSpace
 from torchpose.priors._actions.postures import posture_angles, posture_to_state
 
 
-def write_recording(folder: Path, person: str, action: int, fps: float = 30.0, **change) -> Path:
+def write_recording(folder: Path, person: str, action: int) -> Path:
     """Somebody who does the same thing three times; joints of a body of their own."""
     body = Body.of_height(BODY_15, 1.6 + 0.05 * int(person[-1]))
     parts = performances(3, action, 30, noise=1.0, seed=int(person[-1]))
@@ -27,13 +27,8 @@ def write_recording(folder: Path, person: str, action: int, fps: float = 30.0, *
     rest = posture_angles(body.joints(torch.zeros(body.dim).double()))
     states = posture_to_state(body, (rest + angles).clamp(-80, 80), torch.zeros(body.dim).double())
     states[:, 1] += 0.9
-    arrays = {
-        "joints": body.joints(states).numpy(), "names": np.array(BODY_15.names), "fps": fps,
-        "subject": person, "action": f"action{action}", "source": "set", "axes": "y-up",
-    }  # fmt: skip
     path = folder / f"{person}_{action}.npz"
-    np.savez(path, **{k: v for k, v in {**arrays, **change}.items() if v is not None})
-    return path
+    return write_body(path, body.joints(states), 30.0, person, f"action{action}")
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +111,7 @@ def test_on_one_body_it_makes_no_difference_where_the_shoulders_are(tmp_path) ->
         directions=torch.nn.functional.normalize(directions, dim=-1),
     )  # fmt: skip
     for person, body in (("p0", straight), ("p1", sloping)):
-        write_recording(tmp_path, person, 0, joints=body.joints(states).numpy())
+        write_body(tmp_path / f"{person}.npz", body.joints(states), 30.0, person, "action0")
     apart = {}
     for kind in ("joints", "body"):
         data = Performances.gather([str(tmp_path)], ["action0"], repeated=False, postures=kind)
@@ -143,7 +138,7 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
     rewrite(write_recording(holes, "p6", 0), make_hole)
     timeless = scene.home / "timeless"
     timeless.mkdir(exist_ok=True)
-    write_recording(timeless, "p7", 0, fps=None)
+    rewrite(write_recording(timeless, "p7", 0), lambda arrays: arrays.pop("fps"))
     short = scene.home / "short"
     short.mkdir(exist_ok=True)
     for person in ("p1", "p2"):

@@ -12,6 +12,7 @@ from torchpose.learning import fit_limb_conditionals
 
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
+from tests.recorded_bodies import write_body
 from tests.train.scenes import check_refusals, make_hole, rewrite, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._recipes import LimbStates
@@ -24,8 +25,8 @@ HERTZ = 1.0
 
 
 def write_trial(
-    folder: Path, person: str, trial: int, fps: float = 120.0, scale: float = 1.0, **change
-):
+    folder: Path, person: str, trial: int, fps: float = 120.0, scale: float = 1.0
+) -> Path:
     """Somebody whose limbs swing forwards and backwards, each by a radian of its own."""
     frames = int(2 * fps)
     body = Body.of_height(BODY_15, 1.65 + 0.05 * int(person[-1]))
@@ -35,13 +36,8 @@ def write_trial(
     for i, (part, (size, rest)) in enumerate(SWING.items()):
         angle = rest + scale * size * (phase + i).sin()
         states[:, 3 + 3 * BODY_15.part(part)] = (angle / 2).sin()
-    arrays = {
-        "joints": body.joints(states).numpy(), "names": np.array(BODY_15.names), "fps": fps,
-        "subject": person, "action": f"walk{trial}", "source": "set", "axes": "y-up",
-    }  # fmt: skip
     path = folder / f"{person}_{trial}.npz"
-    np.savez(path, **arrays)
-    return path
+    return write_body(path, body.joints(states), fps, person, f"walk{trial}")
 
 
 @pytest.fixture(scope="module")

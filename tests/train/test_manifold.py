@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,6 +12,7 @@ from torchpose.learning._manifolds import fit_target, gplvm_of_fit
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.motions import motion
+from tests.recorded_bodies import write_body
 from tests.train.scenes import check_refusals, make_hole, rewrite, run, scene_of
 from torchpose.body import BODY_15, Body
 from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma, run_fit
@@ -21,19 +21,14 @@ from torchpose.priors import BackConstrainedGPLVM
 from train.manifold import ManifoldData
 
 
-def write_trial(folder: Path, person: str, trial: int, frames: int, fps: float = 120.0) -> Path:
+def write_trial(folder: Path, person: str, trial: int, frames: int) -> Path:
     """Somebody walks on the spot: joints of a body moved by a cyclic motion."""
     body = Body.of_height(BODY_15, 1.7 + 0.1 * int(person[-1]))
     poses = 0.4 * motion(frames, phase=float(trial), seed=trial, speed=0.5, noise=0.002)
     state = torch.zeros(frames, body.dim, dtype=torch.float64)
     state[:, 1] = 0.9
     joints = body.joints(body.with_relative(state, poses))
-    path = folder / f"{person}_{trial:02}.npz"
-    np.savez(
-        path, joints=joints.numpy(), names=np.array(BODY_15.names), fps=fps, subject=person, action="walk",
-        source="set", axes="y-up",
-    )  # fmt: skip
-    return path
+    return write_body(folder / f"{person}_{trial:02}.npz", joints, 120.0, person, "walk")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import torch
 import torchpose
 from benchmarks.keypoint_bodies.clips import MHAD, WALKS, begun, read_clips
 from benchmarks.keypoint_bodies.sitting import sitting_clips
-from tests.data import data_dir_or_skip
+from tests.data import data_with
 from tests.whole_body.keypoints.scenes import FPS, NAMES, kalman, moving_body, ring, scene
 from torchpose.body import BODY_15, Body
 from torchpose.body._skeleton import other_side
@@ -283,7 +283,7 @@ def test_exchanged_sides_at_the_start_are_soon_forgotten():
 
 
 def test_strangers_are_nearer_than_the_best_still_pose():
-    data = data_dir_or_skip(MHAD).parent
+    data = data_with(MHAD)
     names = {MHAD: ("s09_a09_sit_stand_r1", "s10_a05_wave_two_hands_r1")}
     for clip in read_clips(data, names)[MHAD]:
         one = begun(clip, 60).of_cameras(1)
@@ -301,7 +301,7 @@ def test_strangers_are_nearer_than_the_best_still_pose():
 
 def test_a_height_that_is_told_stays():
     """The network makes limbs short of whose depth it is unsure."""
-    data = data_dir_or_skip(MHAD).parent
+    data = data_with(MHAD)
     (clip,) = read_clips(data, {MHAD: ("s10_a05_wave_two_hands_r1",)})[MHAD]
     one = begun(clip, 60).of_cameras(1)
     track = torchpose.BodyTracker(one.rig, "kalman", fps=one.fps, height=1.7)(
@@ -313,7 +313,7 @@ def test_a_height_that_is_told_stays():
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [2, 4])
 def test_strangers_who_walk_may_be_filmed_at_half_and_a_quarter_of_the_rate(every):
-    data = data_dir_or_skip(WALKS).parent
+    data = data_with(WALKS)
     (clip,) = read_clips(data, {WALKS: ("s16_16_15_walk",)})[WALKS]
     one = begun(clip, 120).of_cameras(1)
     track = torchpose.BodyTracker(one.rig, "kalman", fps=one.fps / every)(
@@ -325,7 +325,7 @@ def test_strangers_who_walk_may_be_filmed_at_half_and_a_quarter_of_the_rate(ever
 
 def test_strangers_behind_a_desk_may_sit():
     """Nobody sees their legs: knees are guessed between those of people who stand and who sit."""
-    clips = sitting_clips(data_dir_or_skip(MHAD).parent)["side"]
+    clips = sitting_clips(data_with(MHAD))["side"]
     off = []
     for clip in (begun(one) for one in clips if "1.3 m" in one.name):
         keypoints = clip.seen.keypoints.clone()
