@@ -1,15 +1,13 @@
 """`torchpose track --detector`: poses of everybody, and what is refused."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from tests.cli.pretended_camera import PretendedCamera, use_camera
 from torchpose import demo
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter, draw_overlay
-from torchpose.video._camera import CameraSource
 
 N = 36
 DETECTOR = """
@@ -92,40 +90,12 @@ def test_a_height_of_several_persons_is_said(track, more):
     assert ("--height was taken for each of the 2 persons" in done.out) == (not more)
 
 
-class Blank:
-    """A camera that shows nothing, at the rate of its own clock."""
-
-    def __init__(self, n_frames):
-        self.left, self.now = n_frames, 0.0
-
-    def isOpened(self):
-        return True
-
-    def read(self):
-        self.left, self.now = self.left - 1, self.now + 1 / 30
-        return self.left >= 0, np.full((480, 640, 3), 90, np.uint8)
-
-    def get(self, prop):
-        return 30.0
-
-    def set(self, prop, value):
-        return True
-
-    def release(self):
-        pass
-
-
 def test_persons_before_a_camera_have_the_names_that_they_had_while_it_ran(
     torchpose, files, folder, monkeypatch
 ):
     """The first one passes by, the second one stays for longer."""
-    camera = Blank(N + 10)
-    clock = SimpleNamespace(monotonic=lambda: camera.now, sleep=lambda seconds: None)
-    monkeypatch.setattr("torchpose.video._camera.time", clock)
-    monkeypatch.setattr(
-        "torchpose.video.open_video",
-        lambda where, fps=None: CameraSource(int(where), fps, lambda index: camera),
-    )
+    grey = np.full((480, 640, 3), 90, np.uint8)
+    use_camera(monkeypatch, PretendedCamera([grey] * (N + 10)))
     shown = []
 
     def spy(image, poses, *others, labels=None, tints=None, **options):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.cli.pretended_camera import PretendedCamera, use_camera
 from torchpose import demo
 from torchpose.cli._common import UntilInterrupted
 from torchpose.cli._track_video import _notes_of_all
@@ -18,7 +19,6 @@ from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter, open_video
-from torchpose.video._camera import CameraSource
 from torchpose.video._file import FileSource
 
 N = 32
@@ -197,36 +197,7 @@ def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch, full_d
         monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
     with open_video(clip[0]) as source:
         images = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR) for frame in source]
-
-    class Capture:
-        """plays the clip at the rate of its own clock; two frames are missed."""
-
-        def __init__(self):
-            self.left, self.now = list(images), 0.0
-
-        def isOpened(self):
-            return True
-
-        def read(self):
-            self.now += (2 if len(self.left) % 10 == 5 else 1) / 30
-            return (True, self.left.pop(0)) if self.left else (False, None)
-
-        def get(self, prop):
-            return 30.0 if prop == cv2.CAP_PROP_FPS else 0.0
-
-        def set(self, prop, value):
-            return True
-
-        def release(self):
-            pass
-
-    capture = Capture()
-    clock = SimpleNamespace(monotonic=lambda: capture.now, sleep=lambda seconds: None)
-    monkeypatch.setattr("torchpose.video._camera.time", clock)
-    monkeypatch.setattr(
-        "torchpose.video.open_video",
-        lambda where, fps=None: CameraSource(int(where), fps, capture=lambda index: capture),
-    )
+    use_camera(monkeypatch, PretendedCamera(images, missed=lambda left: left % 10 == 5))
     done, out = track("0")
     assert done.code == 0, done.err
     assert "live at http://127.0.0.1:" in done.out
