@@ -14,11 +14,10 @@ from torchpose.learning._curation import (
     CurationReport,
     CurationSettings,
     curate,
-    pick_persons,
     refuse_leaks,
 )
 from torchpose.learning._curation.curate import notes_on_recordings
-from torchpose.learning._curation.splits import refuse_both_sides
+from torchpose.learning._curation.splits import pick_sides
 from torchpose.learning._recipes import VERSION, MixtureTask, UpperBodyRecipe
 from torchpose.learning._recipes.choosing import expand_path, fingerprint
 from torchpose.learning._samplers import SampleSource, cached
@@ -186,9 +185,7 @@ def split(
         InputError: unknown persons, or nobody is left. OverlapError: a leak between both sides.
     """
     known = sorted({r.person_id for r in recordings})
-    out = pick_persons(held_out, known)
-    fitted = set(known) - out if persons is None else pick_persons(persons, known)
-    refuse_both_sides(fitted, out)
+    fitted, out = pick_sides(known, persons, held_out)
     if not fitted:
         raise InputError(
             f"nobody is left to fit to: all of {', '.join(known)} are held out; hold fewer out"

@@ -172,15 +172,6 @@ def notes_of_reading(recordings: Iterable[Recording]) -> list[str]:
     ]
 
 
-def refuse_both_sides(fitted: set[str], held_out: set[str]) -> None:
-    """Raise `OverlapError` if a person is to be fitted to and held out."""
-    both = sorted(fitted & held_out)
-    if both:
-        raise OverlapError(
-            f"{', '.join(both)}: held out, but to be fitted to as well; name each person on one side"
-        )
-
-
 def unstated_rates(recordings: Iterable[Recording]) -> list[str]:
     """Return a note on recordings that do not state their frame rate, if there are any."""
     unknown = [label(recording) for recording in recordings if not recording.fps]
@@ -218,6 +209,28 @@ def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
             )
         found.add(fitting[0])
     return found
+
+
+def pick_sides(
+    known: Sequence[str], persons: Iterable[str] | None, held_out: Iterable[str]
+) -> tuple[set[str], set[str]]:
+    """Return the ids of those to fit to, and of those who are held out.
+
+    Args:
+        known: ids of everybody. persons, held_out: names, as of `pick_persons`; without `persons` everybody
+            is fitted to who is not held out.
+
+    Raises:
+        InputError: as `pick_persons`. OverlapError: a person on both sides.
+    """
+    out = pick_persons(held_out, known)
+    fitted = set(known) - out if persons is None else pick_persons(persons, known)
+    both = sorted(fitted & out)
+    if both:
+        raise OverlapError(
+            f"{', '.join(both)}: held out, but to be fitted to as well; name each person on one side"
+        )
+    return fitted, out
 
 
 def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) -> PersonSplit:

@@ -6,6 +6,7 @@ The fits of manifolds, limbs and actions do so alike, from `torchpose fit` and f
 import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -25,8 +26,8 @@ from torchpose.io._recordings import (
     read_recordings,
 )
 from torchpose.learning._curation.splits import (
-    pick_persons,
-    refuse_both_sides,
+    persons_of,
+    pick_sides,
     refuse_shared_recordings,
 )
 from torchpose.learning._recipes.gaps import LONGEST_GAP, fill_short_gaps, missing_joints
@@ -71,18 +72,9 @@ def choose_recordings(
     """
     given = [expand_path(path) for path in paths]
     files = find_recordings(given)
-    unknown = sorted(set(without or ()) - {file.stem for file in files})
-    if unknown:
-        raise InputError(f"without: no file named {', '.join(unknown)} among the recordings")
-    left = [file for file in files if file.stem not in (without or ())]
-    if not left:
-        raise InputError("without: names all of the recordings; name fewer")
-    recordings = read_recordings(left, axes)
-    recordings = [r for r in recordings if not r.companion]
-    known = sorted({r.person_id for r in recordings})
-    out = pick_persons(held_out or (), known)
-    wanted = set(known) - out if persons is None else pick_persons(persons, known)
-    refuse_both_sides(wanted, out)
+    read = read_recordings(_without(files, without or ()), axes)
+    recordings = [r for r in read if not r.companion]
+    wanted, out = pick_sides(persons_of(recordings), persons, held_out or ())
     if actions is not None:
         done = sorted({r.action for r in recordings})
         missing = [action for action in actions if action not in done]
@@ -104,6 +96,21 @@ def choose_recordings(
         )
     refuse_shared_recordings(found.train, found.watched)
     return found
+
+
+def _without(files: Sequence[Path], names: Sequence[str]) -> list[Path]:
+    """Return the files without those of some names.
+
+    Raises:
+        InputError: no file of a name, or all files named.
+    """
+    unknown = sorted(set(names) - {file.stem for file in files})
+    if unknown:
+        raise InputError(f"without: no file named {', '.join(unknown)} among the recordings")
+    left = [file for file in files if file.stem not in names]
+    if not left:
+        raise InputError("without: names all of the recordings; name fewer")
+    return left
 
 
 def recording_name(recording: Recording) -> str:
