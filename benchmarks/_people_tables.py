@@ -8,6 +8,7 @@ from pathlib import Path
 from benchmarks._upper_body import Scores
 from torchpose.evaluation import Report
 from torchpose.evaluation._person_tables import SHORT_NAMES
+from torchpose.evaluation._report import Table
 from torchpose.evaluation._trials import HANDS, Trials, add_picture
 from torchpose.metrics import jitter
 from torchpose.metrics._pose_errors import PCP, share_below
@@ -127,22 +128,26 @@ def add_findings(report: Report) -> None:
     table = report["coverage"]
     for name in (MAIN, f"{DEFAULT}, filtered", UNCALIBRATED, BASELINE):
         rows = [row for row in table.rows if row in (f"{name}, 50 %", f"{name}, 90 %")]
-        if not rows:
-            continue
-        gaps = {
-            f"{joint} at {table[row, 'level']} %": float(table[row, joint]) - table[row, "level"]
-            for row in rows
-            for joint in SHORT_NAMES
-        }
-        worst = max(gaps, key=lambda k: abs(gaps[k]))
-        hidden = [j for j in SHORT_NAMES if j.startswith("elbow")]
-        elbows = sum(float(table[rows[-1], j]) for j in hidden) / len(hidden)
-        report.findings.append(
-            f"Coverage of '{name}': the furthest from nominal is {worst}, by {gaps[worst]:+.0f} "
-            f"points; {sum(abs(g) <= 5 for g in gaps.values())} of {len(gaps)} are within 5 points; "
-            f"elbows, which are never measured, are inside their 90 % ellipsoid "
-            f"{elbows:.0f} % of the time."
-        )
+        if rows:
+            report.findings.append(f"Coverage of '{name}': {_coverage_text(table, rows)}")
+
+
+def _coverage_text(table: Table, rows: list[str]) -> str:
+    """Return how far shares in ellipsoids are from nominal, and how they hold elbows."""
+    gaps = {
+        f"{joint} at {table[row, 'level']} %": float(table[row, joint]) - table[row, "level"]
+        for row in rows
+        for joint in SHORT_NAMES
+    }
+    worst = max(gaps, key=lambda k: abs(gaps[k]))
+    hidden = [j for j in SHORT_NAMES if j.startswith("elbow")]
+    elbows = sum(float(table[rows[-1], j]) for j in hidden) / len(hidden)
+    return (
+        f"the furthest from nominal is {worst}, by {gaps[worst]:+.0f} "
+        f"points; {sum(abs(g) <= 5 for g in gaps.values())} of {len(gaps)} are within 5 points; "
+        f"elbows, which are never measured, are inside their 90 % ellipsoid "
+        f"{elbows:.0f} % of the time."
+    )
 
 
 def add_pictures(report: Report, out: Path, scores: dict[str, Scores]) -> None:

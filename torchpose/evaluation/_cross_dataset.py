@@ -142,19 +142,9 @@ def run(
     """
     check_count("every", every)
     check_count("workers", workers)
-    if part not in ("both", "cross", "added"):
-        raise InputError(f"part must be cross, added or both, got {part!r}")
     check_positive("mocap_share", mocap_share)
     folders = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
-    if added and (part == "cross" or len(folders) == 1):
-        raise InputError(
-            "added: motion capture is for the second part (added or both) on two folders or more, got part "
-            f"{part} and {counted(len(folders), 'folder')}; leave --added out"
-        )
-    if len(folders) > 1 and not added:
-        if part == "added":
-            raise InputError("expected folders of motion capture with --added, got none")
-        part = "cross"
+    part = _part_of(part, len(folders), added)
     out = check_output_folder(out)
     read = _read(folders, added, part)
     _check_tested(read, tested)
@@ -183,6 +173,26 @@ def run(
     report.findings += read.notes
     report.save(out)
     return report
+
+
+def _part_of(part: str, n_folders: int, added: Sequence[str]) -> str:
+    """Return the part that is run: the first one alone where there is nothing for the second.
+
+    Raises:
+        InputError: an unknown part, or motion capture that no part takes, or that is missing.
+    """
+    if part not in ("both", "cross", "added"):
+        raise InputError(f"part must be cross, added or both, got {part!r}")
+    if added and (part == "cross" or n_folders == 1):
+        raise InputError(
+            "added: motion capture is for the second part (added or both) on two folders or more, got part "
+            f"{part} and {counted(n_folders, 'folder')}; leave --added out"
+        )
+    if n_folders == 1 or added:
+        return part
+    if part == "added":
+        raise InputError("expected folders of motion capture with --added, got none")
+    return "cross"
 
 
 def _report_cross(
