@@ -18,10 +18,10 @@ import torch
 from benchmarks._command import run_command
 from benchmarks._table_file import TableFile, save_text
 from benchmarks._upper_body import score
-from benchmarks.ub_people import TEST_PERSONS, people, sway
+from benchmarks.ub_people import TEST_PERSONS, people, still_and_moving
 from torchpose.camera import PinholeCamera
 from torchpose.errors import OverlapError
-from torchpose.evaluation._trials import CAMERA, Trials, centred_on_neck, make_test_set, track
+from torchpose.evaluation._trials import Trials, track
 from torchpose.priors import UpperBodyPrior, load_prior
 
 FOCAL, CENTRE = 525.0, (319.5, 239.5)  # of the test camera
@@ -55,11 +55,7 @@ def main(
     fitted = load_prior(prior)
     _, tested = people(data, quick)
     tested = tested[:: 3 if quick else 1]
-    poses = [centred_on_neck(recording.upper_body().joints) for recording in tested]
-    fps = tested[0].fps or 30.0
-    still = make_test_set(poses, CAMERA, fps)
-    paths = [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
-    moving = make_test_set(poses, CAMERA, fps, paths=paths)
+    still, moving = still_and_moving(tested)
     lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
     trackers = dict(list(TRACKERS.items())[: 1 if quick else None])
     for name, options in trackers.items():

@@ -31,6 +31,7 @@ from benchmarks import bones
 from benchmarks._command import OneOf, run_command
 from benchmarks._table_file import TableFile, print_tables
 from benchmarks.unseen_sets import NAMES, Unseen, leave_out
+from torchpose import PoseTrack
 from torchpose.evaluation import Report
 from torchpose.evaluation._report import Table
 from torchpose.metrics import coverage
@@ -123,7 +124,7 @@ class _Ends(NamedTuple):
 
 
 def scored(
-    view: bones.View, poses: torchpose.PoseTrack, gone: Bool[Tensor, "T J"], kind: str, later: bool
+    view: bones.View, poses: PoseTrack, gone: Bool[Tensor, "T J"], kind: str, later: bool
 ) -> list[float]:
     """Return a row for a recording.
 

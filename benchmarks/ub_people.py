@@ -42,6 +42,7 @@ from benchmarks._upper_body import (
     plain_prior,
     projected_training_poses,
     score,
+    trials_of,
     with_bones,
 )
 from benchmarks.engine import Grid
@@ -55,7 +56,6 @@ from torchpose.evaluation._trials import (
     Trials,
     cached_prior,
     centred_on_neck,
-    make_test_set,
 )
 from torchpose.io import Recording, read_recordings
 from torchpose.io._recordings import cut_recording
@@ -111,11 +111,7 @@ def run(
     if prior is None:
         prior = cached_prior(out, train, recipe, progress, **settings)
     prior.check_unseen({r.person_id for r in tested})
-    poses = [centred_on_neck(r.upper_body().joints) for r in tested]
-    fps = tested[0].fps or 30.0
-    still = make_test_set(poses, CAMERA, fps, seed)
-    paths = [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
-    moving = make_test_set(poses, CAMERA, fps, seed, paths=paths)
+    still, moving = still_and_moving(tested, seed)
     report = Report("UB-people", _settings(train, tested, still, prior, settings, quick))
     lag = 0 if quick else lag
     projected = projected_training_poses(train, CAMERA, 2_000 if quick else _N_PROJECTED, seed)
@@ -128,7 +124,8 @@ def run(
     add_pcp_table(report, {name: s.limbs for name, s in scores.items()})
     add_calibration_table(report, prior, scores)
     if n_gap_sequences:
-        add_gap_tables(report, out, prior, poses, fps, seed, n_gap_sequences, progress, quick)
+        poses = [centred_on_neck(r.upper_body().joints) for r in tested]
+        add_gap_tables(report, out, prior, poses, still.fps, seed, n_gap_sequences, progress, quick)
     add_findings(report)
     add_pictures(report, out, scores)
     report.save(out)
@@ -154,6 +151,17 @@ def people(data: str | Path, quick: bool = False) -> tuple[list[Recording], list
         few = tested[:: max(1, len(tested) // 10)]
         return train[:: max(1, len(train) // 40)], [cut_recording(r, 0, _QUICK_FRAMES) for r in few]
     return train, tested
+
+
+def still_and_moving(recordings: Sequence[Recording], seed: int = 0) -> tuple[Trials, Trials]:
+    """Return the tests of people whose necks stay in their place, and of the same who `sway`.
+
+    Args:
+        recordings: of one frame rate. seed: of the noise.
+    """
+    fps = recordings[0].fps or 30.0
+    paths = [sway(len(r), fps, i / len(recordings)) for i, r in enumerate(recordings)]
+    return trials_of(recordings, seed), trials_of(recordings, seed, paths=paths)
 
 
 def sway(n_frames: int, fps: float, phase: float = 0.0) -> Float[Tensor, "T 3"]:

@@ -30,7 +30,7 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
 from benchmarks._upper_body import score
-from benchmarks.ub_people import people, sway
+from benchmarks.ub_people import people, still_and_moving
 from torchpose.camera import project, sample_viewpoints
 from torchpose.evaluation import Report
 from torchpose.evaluation._person_tables import SHORT_NAMES
@@ -40,7 +40,6 @@ from torchpose.evaluation._trials import (
     Estimate,
     Trials,
     centred_on_neck,
-    make_test_set,
 )
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.math import euler_to_matrix
@@ -205,11 +204,7 @@ def main(
     """
     train, tested = people(data, quick)
     poses = [centred_on_neck(r.upper_body().joints).float() for r in train]
-    unseen = [centred_on_neck(r.upper_body().joints) for r in tested]
-    fps = tested[0].fps or 30.0
-    still = make_test_set(unseen, CAMERA, fps)
-    paths = [sway(len(p), fps, i / len(unseen)) for i, p in enumerate(unseen)]
-    moving = make_test_set(unseen, CAMERA, fps, paths=paths)
+    still, moving = still_and_moving(tested)
     trainers: dict[str, Callable[[int], nn.Module]] = {
         "MLP, per frame": lambda s: train_frames(poses, targets, s, quick),
         "GRU, causal": lambda s: train_sequences(poses, targets, s, quick, False),

@@ -25,7 +25,7 @@ from torch import Tensor
 from benchmarks._command import run_command
 from benchmarks._table_file import TableFile, print_tables
 from benchmarks.hand_network.clips import BELOW, BURN_IN, PEOPLE, Clip, Labels, read_clips
-from torchpose import PinholeCamera, UpperBodyTracker, VideoTracker, load_prior
+from torchpose import PinholeCamera, PoseTrack, UpperBodyTracker, VideoTracker, load_prior
 from torchpose._core.images import Image
 from torchpose.evaluation import Report
 from torchpose.priors import UpperBodyPrior
