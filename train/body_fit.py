@@ -12,7 +12,6 @@ from torch.optim import Optimizer
 
 from torchpose.errors import InputError
 from torchpose.io._results import ResultsFolder
-from train.callbacks import PriorWriter
 from train.checkpoints import ENTRY, check_identity
 from train.data import data_of
 
@@ -118,14 +117,12 @@ class BodyFit(LightningModule):
         """Log numbers of this step in double precision."""
         self.log_dict({k: torch.tensor(float(v)).double() for k, v in found.items()}, on_step=True)
 
-    def finished_prior(self, **facts: str) -> None:
-        """Write the model where a prior's file would be; there is no prior to be calibrated."""
-        writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
-        if writers and self.trainer.is_global_zero:
-            print(self.write(writers[0].results, writers[0].out.name, **facts), flush=True)
-
     def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
-        """Write the model's file and its card, and return what to say of it; a subclass does."""
+        """Write the model's file and its card, and return what to say of it; a subclass does.
+
+        Args:
+            results, file: where a prior's file would be. facts: name, licence, command.
+        """
         raise NotImplementedError
 
     @property

@@ -17,6 +17,7 @@ from torchpose._core.terminal import show_progress
 from torchpose.learning._fit_files import check_fit_file, fit_results, write_prior_files
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
+from train.body_fit import BodyFit
 from train.mixture_em import MixtureEM
 from train.stopping import terminate
 
@@ -193,12 +194,20 @@ class PriorWriter(Callback):
             if trainer.is_global_zero:
                 print(f"a trial (fast_dev_run): {self.out} is not written", flush=True)
             return
-        finish = getattr(pl_module, "finished_prior", None)
+        done = self._written(pl_module)
+        if done is not None:
+            print(done, flush=True)
+
+    def _written(self, module: LightningModule) -> str | None:
+        """Write what was fitted, and return what to say of it; None where another process writes."""
+        if isinstance(module, BodyFit):
+            here = module.trainer.is_global_zero
+            return module.write(self.results, self.out.name, **self._facts) if here else None
+        finish = getattr(module, "finished_prior", None)
         prior = finish(**self._facts) if finish else None
         if prior is None:
-            return
-        done = write_prior_files(prior, self.results, self.out.name, self._pictures)
-        print(done, flush=True)
+            return None
+        return write_prior_files(prior, self.results, self.out.name, self._pictures)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Remove temporary files."""
