@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import sys
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ import torch
 from tests.cli.pretended_camera import PretendedCamera, use_camera
 from torchpose import demo
 from torchpose.cli._common import UntilInterrupted
-from torchpose.cli._track_video import _notes_of_all
+from torchpose.cli._track_output import notes_of_all
 from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
@@ -163,14 +162,8 @@ def test_several_persons_and_then_one(clip, track, tmp_path):
 
 
 def test_notes_of_all_persons_are_said_once_and_by_name_where_they_differ():
-    people = [
-        SimpleNamespace(track=SimpleNamespace(notes=notes))
-        for notes in (
-            ("a focal length", "1 outlier", "cuts"),
-            ("a focal length", "2 outliers", "cuts"),
-        )
-    ]
-    assert _notes_of_all(people, ["person 1", "person 2"]) == (
+    notes = ("a focal length", "1 outlier", "cuts"), ("a focal length", "2 outliers", "cuts")
+    assert notes_of_all(notes, ["person 1", "person 2"]) == (
         "a focal length", "cuts", "person 1: 1 outlier", "person 2: 2 outliers",
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from torchpose._core.wording import counted
 from torchpose.cli._body_overlays import overlay_name, span_of
-from torchpose.cli._track_output import person_suffix
+from torchpose.cli._track_output import notes_of_all, person_suffix
 from torchpose.errors import DegenerateFilterWarning
 
 if TYPE_CHECKING:
@@ -183,16 +183,9 @@ def write_page(
     return [page]
 
 
-def _notes_of(people: "Sequence[BodyTrack]") -> list[str]:
-    """Return the notes that all persons have, and those of single ones."""
-    shared = [note for note in people[0].notes if all(note in one.notes for one in people)]
-    own = [
-        f"person {place}: {note}"
-        for place, one in enumerate(people, 1)
-        for note in one.notes
-        if note not in shared
-    ]
-    return shared + own
+def _notes_of(people: "Sequence[BodyTrack]") -> tuple[str, ...]:
+    names = [f"person {place}" for place, _ in enumerate(people, 1)]
+    return notes_of_all([poses.notes for poses in people], names)
 
 
 def summary(

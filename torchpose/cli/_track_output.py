@@ -221,6 +221,22 @@ def person_suffix(place: int) -> str:
     return "" if place == 1 else f"_p{place:02d}"
 
 
+def notes_of_all(notes: Sequence[Sequence[str]], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the notes that all persons have, each once, and those of single ones after their names.
+
+    Args:
+        notes: of each person. names: of the persons.
+    """
+    common = [note for note in notes[0] if all(note in own for own in notes)]
+    own = [
+        f"{name}: {note}"
+        for name, of_one in zip(names, notes, strict=True)
+        for note in of_one
+        if note not in common
+    ]
+    return (*common, *own)
+
+
 def percent(share: float) -> str:
     """Return a share as a rounded percentage, which is 100 % only of all and 0 % only of none."""
     if 0 < share < 0.001:

@@ -16,6 +16,7 @@ from torchpose.cli._picture_process import PictureProcess
 from torchpose.cli._track_output import (
     TrackingJob,
     camera_text,
+    notes_of_all,
     person_suffix,
     report_failure,
     smoothing_text,
@@ -93,7 +94,7 @@ def track_video(
         facts = _facts(job, options, source, prior, camera, people[0].track.method, rate)
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         names = _names(people, source.reopenable)
-        notes = _notes_of_all(people, names)
+        notes = notes_of_all([person.track.notes for person in people], names)
         written = _write_poses(people, source, n_frames, results, pictures, overlay, other)
         if overlay:
             title = Path(job.input).name
@@ -347,21 +348,6 @@ def _note_on_facts(settings: "TrackSettings", n_people: int) -> tuple[str, ...]:
     flag = f"--{facts[0].replace('_', '-')}"
     return (
         f"{flag} was taken for each of the {n_people} persons; --max-persons 1 tracks one of them",
-    )
-
-
-def _notes_of_all(people: list["TrackedPerson"], names: list[str]) -> tuple[str, ...]:
-    """Return the notes of all persons, each once; the name comes first where not all have a note."""
-    own = [person.track.notes for person in people]
-    common = [note for note in own[0] if all(note in notes for notes in own)]
-    return (
-        *common,
-        *(
-            f"{name}: {note}"
-            for name, notes in zip(names, own, strict=True)
-            for note in notes
-            if note not in common
-        ),
     )
 
 
