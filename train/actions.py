@@ -82,14 +82,13 @@ class ActionFit(BodyFit):
         self._recipe = ActionRecipe(**self.settings)
         self._fitted: FittedActions | None = None
 
-    def training_step(self, batch: int, batch_idx: int) -> None:
+    def fit_at_once(self) -> dict[str, float]:
         """Fit every action."""
         fitted = self._fit()
         found = {"explained": [s.info.explained or 0.0 for s, _ in fitted.spaces.values()]}
         if fitted.accepted:
             found["accepted"] = list(fitted.accepted.values())
-        self.log_all({k: float(torch.tensor(v).double().mean()) for k, v in found.items()})
-        self.trainer.should_stop = True
+        return {k: float(torch.tensor(v).double().mean()) for k, v in found.items()}
 
     def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
         """Write the action space or bank, and its picture."""

@@ -59,8 +59,8 @@ class BodyData(LightningDataModule):
 class BodyFit(LightningModule):
     """Base of the fits that one process does with an optimiser of its own, or with none.
 
-    A subclass calls `save_hyperparameters` in its constructor, names its data and what it fits, and writes
-    its model.
+    A subclass calls `save_hyperparameters` in its constructor, names its data and what it fits, fits
+    (`fit_at_once`, or in steps of its own), and writes its model (`write`).
 
     Attributes:
         data_type: the data module that it takes. what: what is fitted, for the refusal of several
@@ -112,6 +112,15 @@ class BodyFit(LightningModule):
 
     def go_on_from(self, kept: dict[str, Any]) -> None:
         """Restore what `progress_made` returned."""
+
+    def training_step(self, batch: int, batch_idx: int) -> None:
+        """Fit at once; a subclass whose fit takes several steps has a step of its own."""
+        self.log_all(self.fit_at_once())
+        self.trainer.should_stop = True
+
+    def fit_at_once(self) -> dict[str, float]:
+        """Fit, and return the numbers that are logged; a subclass does, unless it has its own step."""
+        raise NotImplementedError
 
     def log_all(self, found: Mapping[str, float]) -> None:
         """Log numbers of this step in double precision."""

@@ -78,14 +78,12 @@ class BodyMotionFit(BodyFit):
         )
         self.save_hyperparameters(asdict(self._recipe))
 
-    def training_step(self, batch: int, batch_idx: int) -> None:
+    def fit_at_once(self) -> dict[str, float]:
         """Fit the prior; the fit is repeated where the file is written, since it takes little time."""
         _, held_out = fit_motion(self.gathered, self._recipe)
-        found: dict[str, float] = {"frames": sum(len(s.residual) for s in self.gathered.train)}
-        if held_out is not None:
-            found = {"acceleration": held_out.acceleration, "log_density": held_out.log_density}
-        self.log_all(found)
-        self.trainer.should_stop = True
+        if held_out is None:
+            return {"frames": sum(len(s.residual) for s in self.gathered.train)}
+        return {"acceleration": held_out.acceleration, "log_density": held_out.log_density}
 
     def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
         """Write the prior."""

@@ -57,14 +57,12 @@ class LimbFit(BodyFit):
         check_least_std(least_std)
         self.save_hyperparameters()
 
-    def training_step(self, batch: int, batch_idx: int) -> None:
+    def fit_at_once(self) -> dict[str, float]:
         """Fit the conditionals; the fit is repeated where the file is written, since it takes no time."""
         _, held_out = fit_limbs(self.gathered, **self.settings)
-        found = {"frames": sum(map(len, self.gathered.train))} if held_out is None else {
-            "deviation": held_out.deviation, "speed": held_out.speed,
-        }  # fmt: skip
-        self.log_all(found)
-        self.trainer.should_stop = True
+        if held_out is None:
+            return {"frames": sum(map(len, self.gathered.train))}
+        return {"deviation": held_out.deviation, "speed": held_out.speed}
 
     def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
         """Write the conditionals."""
