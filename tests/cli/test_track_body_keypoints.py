@@ -87,12 +87,17 @@ def write_cameras(folder) -> list[PinholeCamera]:
     return cameras
 
 
+def write_grey(path, n_frames=N) -> None:
+    """A video in which nothing is to be seen."""
+    with VideoWriter(path, FPS, (WIDTH, HEIGHT)) as writer:
+        for _ in range(n_frames):
+            writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+
+
 def write_videos(folder) -> None:
     """Grey videos of all cameras."""
     for name in PLACES:
-        with VideoWriter(folder / f"{name}.mp4", FPS, (WIDTH, HEIGHT)) as writer:
-            for _ in range(N):
-                writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+        write_grey(folder / f"{name}.mp4")
 
 
 def on_files(torchpose, folder, *always):
@@ -363,9 +368,7 @@ def test_the_body_is_drawn_as_a_turned_camera_sees_it(torchpose, scene, tmp_path
 
 
 def test_a_video_that_ends_before_the_keypoints_is_said(track, tmp_path):
-    with VideoWriter(tmp_path / "short.mp4", FPS, (WIDTH, HEIGHT)) as writer:
-        for _ in range(3):
-            writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    write_grey(tmp_path / "short.mp4", 3)
     videos = ("--camera-names", "[front]", "--videos", tmp_path / "short.mp4", "--height", "1.75")
     done = track(tmp_path / "out", "front.npz", *videos, "--pictures", "false")
     assert done.code == 0 and "a video ends after 3 frames" in done.out

@@ -2,16 +2,14 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
-from tests.cli.test_track_body import HEIGHT, WIDTH, N, arms_rise
-from tests.cli.test_track_body_keypoints import keypoints_of, write_openpose
+from tests.cli.test_track_body import HEIGHT, WIDTH, arms_rise
+from tests.cli.test_track_body_keypoints import keypoints_of, write_grey, write_openpose
 from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.io import write_keypoints
-from torchpose.video import VideoWriter
 from torchpose.whole_body import BodyTrack
 
 PLAIN = ("--height", 1.75, "--pictures", "false", "--overlay", "false")
@@ -41,9 +39,7 @@ def scene(tmp_path_factory):
     write_keypoints(folder / "tilted.npz", keypoints_of(tilted(joints)[..., :2]))
     write_keypoints(folder / "seen.csv", keypoints_of(pixels, image_size=None))
     write_openpose(folder / "json", pixels.numpy())
-    with VideoWriter(folder / "clip.mp4", 50.0, (WIDTH, HEIGHT)) as writer:
-        for _ in range(N):
-            writer.write(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    write_grey(folder / "clip.mp4")
     save_cameras([camera], folder / "cameras.toml")
     return folder, joints
 

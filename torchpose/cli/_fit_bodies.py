@@ -31,6 +31,9 @@ KINDS = tuple(_EXAMPLES)
 PYTHON_ONLY = frozenset({"gamma_x", "optimiser", "learning_rate"})
 """Settings of recipes that only Python and the training loop have."""
 
+_Parts = tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]
+"""What fits, and its options: those that choose recordings, and those of the recipe."""
+
 _OF_BANKS = ("stay", "spread", "background", "evidence_rate", "gate_dimensions")
 _WORDS = ("persons", "held_out", "actions", "without")
 
@@ -94,7 +97,7 @@ def _gathered(gather: Callable[..., Any], *leave_out: str) -> tuple[Option, ...]
 # --- manifolds ------------------------------------------------------------------------------------
 
 
-def _manifold() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+def _manifold() -> _Parts:
     from torchpose.learning._recipes.manifold import ManifoldPoses, ManifoldRecipe
 
     return fit_manifold, _gathered(ManifoldPoses.gather), options_of(ManifoldRecipe, PYTHON_ONLY)
@@ -154,7 +157,7 @@ def fit_manifold(
 # --- limbs ----------------------------------------------------------------------------------------
 
 
-def _limbs() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+def _limbs() -> _Parts:
     from torchpose.learning._recipes.limbs import LimbStates
     from torchpose.learning._recipes.limbs import fit_limbs as recipe
 
@@ -199,7 +202,7 @@ def fit_limbs(
 # --- actions --------------------------------------------------------------------------------------
 
 
-def _actions() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+def _actions() -> _Parts:
     from torchpose.learning._recipes.actions import ActionRecipe, Performances
 
     return fit_actions, _gathered(Performances.gather, "postures"), options_of(ActionRecipe)
@@ -252,7 +255,7 @@ def fit_actions(
 # --- how bodies move ------------------------------------------------------------------------------
 
 
-def _body() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+def _body() -> _Parts:
     from torchpose.learning._body_motion_fit import BodyMotionRecipe
     from torchpose.learning._recipes.body_motion import RecordedMotion
 
