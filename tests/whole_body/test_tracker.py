@@ -8,7 +8,7 @@ import torch
 
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import BODY_15, Body
-from torchpose.errors import InputError, NobodySeenError, PriorError
+from torchpose.errors import InputError, NobodySeenError, PriorError, ShapeError
 from torchpose.learning import fit_limb_conditionals
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import (
@@ -179,6 +179,14 @@ def test_a_frame_counts_if_every_camera_sees_somebody():
         ("apf", {"n_particles": 23, "n_layers": 6}, "at least 24"),
         (None, {"action": "exercises", "conditionals": "walk"}, "choose by method root or constr"),
         (None, {"fps": 0.0}, "fps"),
+        ("apf", {"n_layers": 0}, "n_layers must be at least 1"),
+        ("apf", {"resample_threshold": 0.5}, "'resample_threshold' does nothing for method apf"),
+        ("sir", {"limits": 3}, "limits must be a torchpose.body.JointLimits.* clamp, got int"),
+        ("mrpf", {"manifold": 3}, "manifold must be a BackConstrainedGPLVM or the name"),
+        ("root", {"conditionals": Body}, "conditionals must be a LimbConditionals or the name"),
+        ("constrained", {"action": 3}, "action must be an ActionSpace or ActionBank or the name"),
+        ("constrained", {"action": "exercises", "posture_body": 1.75}, "posture_body must be a"),
+        ("constrained", {"action": "exercises", "max_redraws": 1.5}, "max_redraws must be a whole"),
     ],
 )
 def test_what_does_not_go_together_is_refused(method, options, said):
@@ -201,6 +209,27 @@ def test_keypoints_are_given_by_name_and_as_tensors():
     ):
         with pytest.raises(InputError, match=f"{name} must be a tensor, got"):
             particles.step(state, **given)
+
+
+def test_what_are_no_silhouettes_nor_a_pose_is_named(scene):
+    states, silhouettes = scene
+    tracker = BodyTracker(rig(), "sir", body=walker(), n_particles=20)
+    for given, said in (
+        (silhouettes.numpy(), "silhouettes must be a tensor, got ndarray"),
+        ([frame.numpy() for frame in silhouettes], "silhouettes must be a tensor, got ndarray"),
+        ("walk.mp4", "got str; read_silhouettes"),
+        (8, "got int; read_silhouettes"),
+        (silhouettes[:, 0], r"a frame of silhouettes must have shape \[C, H, W\]"),
+    ):
+        for run in (tracker, tracker.init):
+            with pytest.raises((InputError, ShapeError), match=said):
+                run(given)
+    with pytest.raises(InputError, match="needs a frame of silhouettes, got none"):
+        tracker.init(silhouettes[:0])
+    with pytest.raises(InputError, match="initial_state must be a tensor, got ndarray"):
+        tracker(silhouettes, states[0].numpy())
+    with pytest.raises(InputError, match="lengths must be a tensor, got int"):
+        tracker(silhouettes, states[0], lengths=3)
 
 
 def test_a_direction_that_does_nothing_is_refused(scene):

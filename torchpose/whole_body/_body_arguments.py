@@ -7,7 +7,7 @@ from typing import Any
 from jaxtyping import Integer
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError
 from torchpose.whole_body._filter_table import choose_method
@@ -19,11 +19,13 @@ def given_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in arguments.items() if value is not None}
 
 
-def check_kind(name: str, value: object, kind: type) -> None:
+def check_kind(name: str, value: object, *kinds: type) -> None:
     """Raise `InputError` unless an argument is None, of a kind, or the name of a file."""
-    if not isinstance(value, kind | str | Path | None):
+    if value is not None and not isinstance(value, (*kinds, str, Path)):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        article = "an" if wanted.startswith(tuple("AEIOU")) else "a"
         raise InputError(
-            f"{name} must be a {kind.__name__} or the name of its file, got {type(value).__name__}"
+            f"{name} must be {article} {wanted} or the name of its file, got {type(value).__name__}"
         )
 
 
@@ -102,6 +104,7 @@ def check_facing(facing: Any, initial_state: Any, keypoints: Any) -> None:
 
 def whole_length(lengths: Integer[Tensor, "1"]) -> int:
     """Return how many frames of a sequence are tracked; `check_lengths` follows when all are counted."""
+    check_tensors(lengths=lengths)
     check_shape("lengths", lengths, [1])
     if int(lengths) < 1:
         raise InputError(f"lengths must be integers of 1 or more, got {lengths.tolist()}")

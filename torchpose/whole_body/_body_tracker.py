@@ -379,6 +379,8 @@ class BodyTracker(OwnPrecisionModule):
                 )
             given = given_keypoints(keypoints, confidence, names, covariance)
             frames = list(self._by_particles.observed(silhouettes, given)[0])
+            if not frames:
+                raise InputError("a first pose needs a frame of silhouettes, got none")
             initial_state = self._by_particles.first_state(frames, generator, facing)
         first = self._by_particles.begin(initial_state, self.initial_cov, generator)
         return BodyStream(first, 0, generator, _names(names), self._settings)

@@ -17,6 +17,8 @@ from torchpose._core.checks import check_choice, refuse_unused
 from torchpose._core.registry import add_method
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, PriorError
+from torchpose.priors._actions.bank import ActionBank
+from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._shipped import load_action, load_limb_conditionals, load_manifold
@@ -109,13 +111,14 @@ class LearntKind(NamedTuple):
     """Describes a kind of model that filters track with.
 
     Attributes:
-        load: (name or file) -> model. words: what it is, and the command that makes one.
+        types: of models. load: (name or file) -> model. words: what it is, and the command that makes one.
         body: (upright body, model) -> the same person in the frame and about the centres of the model;
             refuses a model of another skeleton.
         at_rate: (model, frames per second) -> the model with its noise for this rate.
         rescaled: (model, frames per second) -> what to say of a model that was learnt at another rate.
     """
 
+    types: tuple[type, ...]
     load: Callable[[str | Path], Any]
     words: str
     body: Callable[[Body, Any], Body]
@@ -167,6 +170,7 @@ def _rescaled_actions(action: Any, fps: float) -> str:
 
 LEARNT = {
     "manifold": LearntKind(
+        (BackConstrainedGPLVM,),
         load_manifold,
         "a manifold of the action's poses (such as walk, or of torchpose fit manifold)",
         _body_of_manifold,
@@ -174,6 +178,7 @@ LEARNT = {
         _rescaled("the manifold's noise", "learnt"),
     ),
     "conditionals": LearntKind(
+        (LimbConditionals,),
         load_limb_conditionals,
         "limb conditionals (such as walk, or of torchpose fit limbs)",
         _body_of_conditionals,
@@ -181,6 +186,7 @@ LEARNT = {
         _rescaled("the limbs' diffusion", "learnt"),
     ),
     "action": LearntKind(
+        (ActionSpace, ActionBank),
         load_action,
         "an action space or a bank of several (such as exercises, or of torchpose fit actions)",
         lambda upright, action: upright,

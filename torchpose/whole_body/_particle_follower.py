@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose._core.module_state import derived
 from torchpose._core.rows import joined
 from torchpose.body._kinematics import Body
@@ -19,7 +19,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError, NobodySeenError
 from torchpose.filters._measurements import check_lengths
-from torchpose.whole_body._body_arguments import whole_length
+from torchpose.whole_body._body_arguments import check_kind, whole_length
 from torchpose.whole_body._body_track import BodyTrack, repeat_last
 from torchpose.whole_body._filter_table import LEARNT, METHODS, make_filter, rebased
 from torchpose.whole_body._filters.body_particles import BodyFilterState
@@ -113,7 +113,7 @@ class ParticleFollower:
         return poses
 
     def observed(
-        self, silhouettes: Iterable[Tensor] | None, given: GivenKeypoints | None
+        self, silhouettes: Iterable[Any] | None, given: GivenKeypoints | None
     ) -> tuple[Iterator[Observed], KeypointFrame | None]:
         """Return the frames one after the other, and the keypoints of all of them.
 
@@ -128,13 +128,31 @@ class ParticleFollower:
                 raise InputError(
                     f"method {self.method} takes silhouettes, keypoints or both, got none"
                 )
-            return map(Observed, silhouettes), None
+            return map(Observed, self._frames(silhouettes)), None
         if callable(self.filter.likelihood):
             raise InputError(
                 "a callable likelihood takes observations of its own; leave out the keypoints"
             )
         measured = self.measurer.measured(given)
-        return observed_frames(silhouettes, self.measurer, measured), measured
+        outlined = None if silhouettes is None else self._frames(silhouettes)
+        return observed_frames(outlined, self.measurer, measured), measured
+
+    def _frames(self, silhouettes: Iterable[Any]) -> Iterator[Tensor]:
+        """Return the frames of silhouettes; `InputError` or `ShapeError` for what are none, when it comes."""
+        if isinstance(silhouettes, str | Path) or not isinstance(silhouettes, Iterable):
+            raise InputError(
+                "silhouettes must be a tensor [T, C, H, W] or frames [C, H, W], got "
+                f"{type(silhouettes).__name__}; read_silhouettes makes them of videos"
+            )
+        plain = not callable(self.filter.likelihood)
+
+        def checked(frame: Any) -> Tensor:
+            check_tensors(silhouettes=frame)
+            if plain:
+                check_shape("a frame of silhouettes", frame, ["C", "H", "W"])
+            return frame
+
+        return map(checked, silhouettes)
 
     def first_seen(
         self, frames: Iterator[Observed], measured: KeypointFrame | None
@@ -183,6 +201,7 @@ class ParticleFollower:
     ) -> BodyFilterState:
         """Return the state before the first frame, of the pose [D] of the filter's body."""
         body: Any = self.filter.body
+        check_tensors(initial_state=initial_state)
         check_shape("initial_state", initial_state, [body.dim])
         return self.filter.init(initial_state[None], generator=generator, initial_cov=initial_cov)
 
@@ -244,6 +263,7 @@ def set_up_particles(
 
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
     """Return a model with its noise for a frame rate, and notes about it."""
+    check_kind(kind, value, *LEARNT[kind].types)
     model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
     return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
 

@@ -20,7 +20,7 @@ from torchpose.math._rotations import (
 )
 from torchpose.whole_body._filters.annealed import anneal
 from torchpose.whole_body._filters.body_frames import check_observation, silhouette_score
-from torchpose.whole_body._filters.body_particles import best_particle
+from torchpose.whole_body._filters.body_particles import best_particle, check_limits
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 
 _ACROSS = 0.1  # metres: how far the middle of a silhouette lies from that of the body
@@ -214,6 +214,7 @@ def find_candidates(
         InputError, ShapeError, CameraError, PriorError: as `find_pose`.
     """
     check_choice("likelihood", likelihood, LIKELIHOODS)
+    check_limits(limits, "clamp")
     if n_headings < 1 or n_particles < n_headings or n_layers < 2:
         raise InputError(
             "a search needs at least 1 heading, 1 particle for each and 2 layers, got "

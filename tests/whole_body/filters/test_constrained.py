@@ -379,7 +379,7 @@ def test_a_gate_that_rejects_everything_is_reported():
     [
         ({"weights": "none"}, "weights must be one of published, normalised"),
         ({"velocity_rate": 1.0}, "velocity_rate must be from 0 to below 1"),
-        ({"max_redraws": -1}, "max_redraws must be 0 or more"),
+        ({"max_redraws": -1}, "max_redraws must be a whole number of 0 or more"),
         ({"fps": 0.0}, "fps must be positive"),
         ({"gate_width": 0.0}, "width must be positive"),
         ({"limb_shape": "cones"}, "limb_shape must be one of cylinders, rectangles"),

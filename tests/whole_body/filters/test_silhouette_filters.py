@@ -26,6 +26,7 @@ from torchpose.whole_body import (
     motion_std,
 )
 from torchpose.whole_body._filters.annealed import anneal
+from torchpose.whole_body._filters.body_particles import resample_state
 from torchpose.whole_body._filters.manifold_regularised import MANIFOLD_PROPOSALS, MANIFOLD_WEIGHTS
 from torchpose.whole_body._sharpness import ValidationSequence, log_grid, mean_joint_error
 
@@ -100,6 +101,19 @@ def test_sharpness_is_an_exponent_of_the_likelihood():
     out = run(sir(sharpness=4.0), z)
     assert_within_error(out.mean, mean)
     assert_within_error(out.std, std, slack=3e-3)
+
+
+def test_first_weights_are_normalised():
+    log_weights = sir(20).init(START[None]).log_weights
+    assert float(log_weights.logsumexp(-1)) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_particles_of_equal_weights_are_left_as_they_are():
+    for n in range(2, 40):
+        state = sir(n).init(START[None], initial_cov=1.0, generator=generator(0))
+        for start in (state, state._replace(log_weights=state.log_weights.exp().log())):
+            after, _ = resample_state(start, "multinomial", 1.0, generator(1))
+            assert torch.equal(after.particles, state.particles), n
 
 
 def test_the_map_estimate_is_the_particle_of_the_largest_weight():
@@ -559,6 +573,9 @@ def test_motion_std_is_the_change_from_frame_to_frame():
         ({"sharpness": math.inf}, "sharpness"),
         ({"resampling": "none"}, "resampling must be one of"),
         ({"resample_threshold": 1.5}, "resample_threshold"),
+        ({"resample_threshold": "1"}, "resample_threshold"),
+        ({"limits": 0.4}, "limits must be a torchpose.body.JointLimits.* clamp, got float"),
+        ({"limits": 0.4, "limit_mode": "discard"}, "its method inside, got float"),
         ({"estimate": "mode"}, "estimate must be one of"),
         ({"limit_mode": "reflect"}, "limit_mode must be one of"),
         ({"process_cov": tensor([1.0, -1.0, 1.0])}, "must not be negative"),
@@ -581,6 +598,7 @@ def test_options_that_are_refused(options, message):
         ({"schedule": [0.1, 1.0]}, "schedule must hold 5"),
         ({"schedule": [0.1, 0.2, 0.3, 0.4, 0.0]}, "positive exponents"),
         ({"noise_decay": 2.0}, "noise_decay"),
+        ({"resample_threshold": 0.5}, "leave resample_threshold out"),
     ],
 )
 def test_options_that_the_annealed_filter_refuses(options, message):
@@ -593,6 +611,17 @@ def test_inputs_that_are_refused():
     tracker = SIRParticleFilter(body, 5)
     with pytest.raises(InputError, match="precision of SIRParticleFilter"):
         tracker.half()
+    with pytest.raises(InputError, match="body must be a torchpose.body.Body, .* got str"):
+        SIRParticleFilter("walker")
+    for given, start, said in (
+        (masks.numpy(), torch.zeros(3), "silhouettes must be a tensor, got ndarray"),
+        (masks, [0.0] * 3, "initial_state must be a tensor, got list"),
+        (None, torch.zeros(3), "must be given, got None"),
+    ):
+        with pytest.raises(InputError, match=said):
+            tracker(given, None, start)
+    with pytest.raises(InputError, match="silhouettes must be a tensor, got list"):
+        tracker.step(tracker.init(torch.zeros(1, 3)), [masks[0]], None)
     with pytest.raises(ShapeError, match="initial_state"):
         tracker(masks, None, torch.zeros(4))
     with pytest.raises(ShapeError, match="initial_state must be"):

@@ -110,7 +110,8 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         survival_rate: alpha of every layer, at least 2 / N.
         schedule: M exponents, instead of those solved from the survival rate.
         noise_decay: factor of the noise's covariance per layer; alpha if None.
-        **options: as `SilhouetteParticleFilter`.
+        **options: as `SilhouetteParticleFilter`, without `resample_threshold`: what is annealed has no
+            weights.
 
     Raises:
         InputError, ShapeError: an argument is not as described.
@@ -121,6 +122,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
     """
 
     least_particles: ClassVar[int] = round(LEAST_SURVIVORS / _SURVIVAL)
+    unused: ClassVar[frozenset[str]] = frozenset({"resample_threshold"})
 
     def __init__(
         self,
@@ -134,6 +136,11 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         **options: Unpack[BodyFilterOptions],
     ) -> None:
         super().__init__(body, n_particles, **options)
+        if self.resample_threshold < 1:
+            raise InputError(
+                "every layer is resampled, and so is the last one before the next frame; leave "
+                f"resample_threshold out, got {self.resample_threshold}"
+            )
         check_count("n_layers", n_layers)
         if schedule is None:
             check_survival_rate(survival_rate, n_particles)
@@ -158,7 +165,9 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
         """Return the number of likelihoods that one particle costs in a frame: the number of layers."""
-        return options.get("n_layers", _LAYERS)
+        n_layers = options.get("n_layers", _LAYERS)
+        check_count("n_layers", n_layers)
+        return n_layers
 
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators

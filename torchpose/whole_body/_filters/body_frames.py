@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose.errors import InputError, ShapeError
 from torchpose.filters._recursive_filter import Generators, check_generators
 from torchpose.whole_body._keypoints.particle_likelihood import (
@@ -152,6 +152,9 @@ def check_sequences(
     Raises:
         ShapeError, InputError: as `SilhouetteParticleFilter.forward`.
     """
+    check_tensors(silhouettes=observed, initial_state=initial_state)
+    if observed is None or initial_state is None:
+        raise InputError("silhouettes and an initial_state must be given, got None")
     check_shape("initial_state", initial_state, ["...", dim])
     if initial_state.ndim > 2:
         raise ShapeError(f"initial_state must be [D] or [B, D], got {list(initial_state.shape)}")
@@ -188,6 +191,7 @@ def check_observation(
     Raises:
         ShapeError, InputError: as `SilhouetteParticleFilter.step` and `advance`.
     """
+    check_tensors(silhouettes=observed)
     sizes = ["B", *["T"] * frames, "C", "H", "W"]
     if observed.ndim <= frames or len(observed) != batch or (frames and not observed.shape[1]):
         raise ShapeError(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpose._core.facade import set_up_facade
 from torchpose.body._kinematics import Body
-from torchpose.errors import DegenerateFilterWarning
+from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.filters._lengths import held_past_lengths, inside_lengths
 from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._recursive_filter import Generators
@@ -19,6 +19,7 @@ from torchpose.filters._resampling import resample
 from torchpose.whole_body._filters.body_frames import Likelihood
 
 _LISTED = 8  # frames that a warning names
+_ROUNDING = 1e-9  # of the effective sample size: particles of equal weights are left as they are
 
 
 @runtime_checkable
@@ -149,6 +150,24 @@ class WeightedParticles(NamedTuple):
     details: dict[str, Tensor] | None = None
 
 
+def check_body(body: object) -> None:
+    """Raise `InputError` unless particles can be moved in this space."""
+    if not isinstance(body, PoseSpace):
+        raise InputError(
+            f"body must be a torchpose.body.Body, or have dim, perturb, difference and mean, got "
+            f"{type(body).__name__}"
+        )
+
+
+def check_limits(limits: object, method: str) -> None:
+    """Raise `InputError` unless limits are None or have this method, as `torchpose.body.JointLimits`."""
+    if limits is not None and not callable(getattr(limits, method, None)):
+        raise InputError(
+            f"limits must be a torchpose.body.JointLimits, or have its method {method}, got "
+            f"{type(limits).__name__}"
+        )
+
+
 def first_true(flags: Bool[Tensor, "*batch T"]) -> Int[Tensor, "*batch"]:
     """Return the first frame that is True, -1 where none is."""
     return torch.where(flags.any(-1), flags.int().argmax(-1), -1)
@@ -235,7 +254,7 @@ def resample_state(
         method: as `resample`. threshold: share of N below which it is due; the other elements stay.
     """
     n = state.particles.shape[1]
-    due = effective_sample_size(state.log_weights) < threshold * n
+    due = effective_sample_size(state.log_weights) < threshold * n * (1 - _ROUNDING)
     # drawn for all: what an element draws must not depend on its neighbours
     ancestors = resample(state.log_weights, method, generator)
     ancestors = torch.where(due[:, None], ancestors, torch.arange(n, device=due.device))

@@ -1,5 +1,6 @@
 """Run the particle filter with action-specific posture constraints (aSpace)."""
 
+from numbers import Integral
 from typing import Any, Unpack
 
 import torch
@@ -117,8 +118,8 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         super().__init__(body, n_particles, **options)
         if velocity_rate is not None and not 0 <= velocity_rate < 1:
             raise InputError(f"velocity_rate must be from 0 to below 1, got {velocity_rate}")
-        if max_redraws < 0:
-            raise InputError(f"max_redraws must be 0 or more, got {max_redraws}")
+        if not isinstance(max_redraws, Integral) or max_redraws < 0:
+            raise InputError(f"max_redraws must be a whole number of 0 or more, got {max_redraws}")
         check_choice("weights", weights, CONSTRAINED_WEIGHTS)
         if weights == "normalised" and isinstance(action, ActionBank):
             raise InputError(
@@ -132,6 +133,10 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         self.velocity_rate, self.max_redraws, self.weights = velocity_rate, max_redraws, weights
         self.fps = fps
         self.gate: PostureGate | None = None
+        if not isinstance(posture_body, Body | None):
+            raise InputError(
+                f"posture_body must be a torchpose.body.Body, got {type(posture_body).__name__}"
+            )
         if action is not None:
             self.gate = PostureGate(body, action, posture_body, gate_width)  # type: ignore[arg-type]
 

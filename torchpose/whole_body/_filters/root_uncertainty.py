@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose._core.checks import check_choice, check_positive, check_shape
+from torchpose._core.checks import check_choice, check_positive, check_shape, number_of
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError
 from torchpose.filters._recursive_filter import Generators, standard_normal
@@ -388,5 +388,5 @@ def _check(body: Any, likelihood: Any, weighting: str, least_std: float, first_s
         )
     check_choice("weighting", weighting, WEIGHTINGS)
     for name, value in (("least_std", least_std), ("first_std", first_std)):
-        if not 0 <= value < math.inf:
+        if not 0 <= number_of(value) < math.inf:
             raise InputError(f"{name} must be zero or more and finite, got {value}")

@@ -19,6 +19,7 @@ from torchpose._core.checks import (
     check_finite,
     check_positive,
     check_shape,
+    number_of,
 )
 from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
 from torchpose._core.module_state import as_one_run
@@ -43,6 +44,8 @@ from torchpose.whole_body._filters.body_particles import (
     PoseSpace,
     WeightedParticles,
     best_particle,
+    check_body,
+    check_limits,
     resample_state,
     stack_outputs,
     without_repeats,
@@ -115,8 +118,10 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         check_choice("resampling", resampling, RESAMPLING)
         check_choice("estimate", estimate, ("mean", "map"))
         check_count("n_particles", n_particles)
-        if not 0 <= resample_threshold <= 1:
+        if not 0 <= number_of(resample_threshold) <= 1:
             raise InputError(f"resample_threshold must be from 0 to 1, got {resample_threshold}")
+        check_body(body)
+        check_limits(limits, "clamp" if limit_mode == "clamp" else "inside")
         check_leg_swap(body, leg_swap)
         check_limb_shape(limb_shape)
         for name, value in (("sharpness", sharpness), ("respread_scale", respread_scale)):
@@ -215,8 +220,10 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         if initial_cov is not None:
             spread = std_of_covariance("initial_cov", initial_cov, self.body.dim)
             particles = self.diffuse(particles, spread.to(self.step_std), generator)
-        uniform = torch.full(particles.shape[:2], -math.log(self.n_particles))
-        uniform = uniform.to(start.device, torch.float64)
+        uniform = torch.full(
+            particles.shape[:2], -math.log(self.n_particles), dtype=torch.float64,
+            device=start.device,
+        )  # fmt: skip
         lost = torch.zeros(len(start), dtype=torch.long, device=start.device)
         memory, trend = self.first_memory(particles), self.first_trend(start)
         return BodyFilterState(particles, uniform, start, lost, memory, trend)
