@@ -215,6 +215,7 @@ def test_bad_input(bank, spaces):
         ([], "got none"),
         ([spaces[0], spaces[0]], "names of their own"),
         ([unnamed], "names of their own"),
+        ([spaces[0], bank], "a list of ActionSpace, got ActionBank"),
         ([spaces[0], other], "one frame rate, got 15, 30"),
     ):
         with pytest.raises(InputError, match=message):

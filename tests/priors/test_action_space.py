@@ -195,7 +195,9 @@ def test_bad_input(space):
         ([good[0][:3], good[1]], "performance 0 has 3 frames, and key frames need at least 8"),
         ([good[0], good[1] * torch.nan], "performance 1 must be finite"),
         ([good[0], good[0].clone()], "all performances are one and the same"),
-        ([0 * good[0] + 3, 0 * good[1] + 3], "all postures are one and the same"),
+        ([0 * good[0] + 3, 0 * good[1] + 3], "all postures of each performance are one and"),
+        ([0 * good[0] + 3, 0 * good[1] + 4], "all postures of each performance are one and"),
+        ([good[0], good[1].numpy()], "performance 1 must be a tensor, got ndarray"),
         ([good[0][:3], good[1][:3]], "performance 0 has 3 frames"),  # not that D is reduced
     ):
         with pytest.raises(InputError, match=message):
@@ -219,6 +221,8 @@ def test_bad_input(space):
         space.clamp_postures(good[0], torch.zeros(len(good[0])).long(), rounds=-1)
     with pytest.raises(InputError, match="at least one posture"):
         space.acceptance(torch.zeros(0, 36).double())
+    with pytest.raises(InputError, match="postures must be finite"):
+        space.acceptance(torch.full((2, 36), torch.nan).double())
     buffers = dict(space.named_buffers())
     with pytest.raises(InputError, match="std must be positive"):
         ActionSpace(**{**buffers, "std": 0 * buffers["std"]})

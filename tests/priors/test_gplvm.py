@@ -245,6 +245,8 @@ def test_deviations_refuse_poses_that_were_fitted_to(manifold) -> None:
             fit_gplvm_noise(manifold, motion(20, seed=3), fps)
     with pytest.raises(InputError, match="a step takes two frames of one sequence"):
         fit_gplvm_noise(manifold, [motion(1, seed=i) for i in range(30, 42)], 60.0)
+    with pytest.raises(InputError, match="need poses that move"):
+        fit_gplvm_noise(manifold, motion(1, seed=3).expand(20, -1), 60.0)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -265,6 +267,11 @@ def test_a_gpu_gives_the_same(manifold) -> None:
 
 
 def test_bad_poses_are_refused(manifold, body) -> None:
+    for bad, name in ((motion(20).numpy(), "poses"), ([motion(20).tolist()], "sequence 0 of")):
+        with pytest.raises(InputError, match=f"{name}.* must be a tensor, got"):
+            fit_gplvm(bad)
+    with pytest.raises(InputError, match="poses must be real"):
+        fit_gplvm(motion(20) + 0j)
     with pytest.raises(InputError, match="at least 10 frames of poses, got 9"):
         fit_gplvm(motion(9))
     with pytest.raises(InputError, match="at least 10 frames of poses, got 0"):

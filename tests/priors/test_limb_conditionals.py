@@ -79,6 +79,11 @@ def test_conditionals_are_the_moments_of_the_relative_rotations(body, sequences,
         np.testing.assert_allclose(conditionals.covariance[edge], np.cov(x.T, bias=True), atol=1e-9)
 
 
+def test_states_of_single_precision_are_fitted_in_that_of_the_body(body, sequences, conditionals):
+    single = fit_limb_conditionals(body, [states.float() for states in sequences], 50.0)
+    torch.testing.assert_close(single.covariance, conditionals.covariance, rtol=1e-4, atol=1e-6)
+
+
 def test_diffusion_is_of_steps_within_sequences(body, sequences, conditionals):
     for part in range(N_PARTS):
         steps = []
@@ -263,6 +268,14 @@ def test_bad_input(body, sequences, conditionals):
         fit(body, [states[:1] for states in sequences], 60.0)
     with pytest.raises(InputError, match="two frames in a row"):
         fit(body, [], 60.0)
+    with pytest.raises(InputError, match="limbs that move"):
+        fit(body, [states[:1].expand(9, -1) for states in sequences], 60.0)
+    with pytest.raises(InputError, match="least_std must be zero or more"):
+        fit(body, sequences, 60.0, least_std=-0.01)
+    with pytest.raises(InputError, match="states must be a tensor, got ndarray"):
+        fit(body, [sequences[0].numpy()], 60.0)
+    with pytest.raises(ShapeError, match=r"states must have shape \[T, 36\], got \[36\]"):
+        in_body_frame([(body, sequences[0])])
     with pytest.raises(InputError, match="fps must be positive"):
         fit(body, sequences, 0.0)
     with pytest.raises(ShapeError, match="states must have shape"):

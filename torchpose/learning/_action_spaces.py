@@ -117,13 +117,14 @@ def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
             f"an action space needs the deviation between performances: expected two or more, got "
             f"{len(performances)}; add recordings, or cut one with `split_repetitions`"
         )
-    for number, performance in enumerate(performances):
-        check_shape(f"performance {number}", performance, ["T", POSTURE_DIM])
     parts = checked_performances(performances)
+    check_shape("performance 0", parts[0], ["T", POSTURE_DIM])
     if all(torch.equal(parts[0], part) for part in parts[1:]):
         raise InputError("all performances are one and the same: there is no deviation to learn")
-    if all(bool((part == parts[0][0]).all()) for part in parts):
-        raise InputError("all postures are one and the same: there is no motion to learn")
+    if all(bool((part == part[0]).all()) for part in parts):
+        raise InputError(
+            "all postures of each performance are one and the same: there is no motion to learn"
+        )
     return parts
 
 

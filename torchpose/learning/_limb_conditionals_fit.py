@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_rate, check_shape
+from torchpose._core.checks import check_finite, check_rate, check_shape, check_tensors, number_of
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BodySkeleton
 from torchpose.errors import InputError
@@ -26,6 +26,7 @@ from torchpose.priors._limb_conditionals import (
 
 _MOST_CANDIDATES = 2000  # training rotations that a centre is looked for among
 _STRIDES = (2, 3, 4)  # frames, over which the growth of diffusion is looked at
+_STILL = 1e-6  # sine of half the angle by which a limb turns in a frame: rounding
 
 
 def fit_limb_conditionals(
@@ -56,16 +57,23 @@ def fit_limb_conditionals(
 
     Raises:
         PriorError: a body of another frame, or an edge of the root. InputError: no states, not
-            finite, no two frames in a row, a rate that is not positive. SkeletonError: an
-            unknown part or edges that are no tree. ShapeError: another number of columns.
+            finite, no two frames in a row, no motion, a rate that is not positive, a negative
+            `least_std`. SkeletonError: an unknown part or edges that are no tree. ShapeError:
+            another number of columns.
     """
     check_body_frame(body)
     check_rate("fps", fps)
+    if not 0 <= number_of(least_std) < math.inf:
+        raise InputError(f"least_std must be zero or more and finite, got {least_std}")
     parts = [sequences] if isinstance(sequences, Tensor) else list(sequences)
     turns = [part_rotations(body, states) for states in parts]
     diffusion = _steps(turns, 1) if turns else None
     if diffusion is None:
         raise InputError("limb conditionals need two frames in a row, got none; add recordings")
+    if not bool((_trace(diffusion[1:]) > _STILL**2).any()):
+        raise InputError(
+            "limb conditionals need limbs that move, got the same pose in all frames of each recording"
+        )
     pairs = _edge_indices(body.skeleton, edges).to(body.centres.device)
     between = edge_rotations(torch.cat(turns), pairs).transpose(0, 1)  # q_ij [E, N, 3]
     every = -(-between.shape[1] // _MOST_CANDIDATES)
@@ -122,9 +130,10 @@ def part_rotations(body: Body, states: Tensor) -> Float[Tensor, "T P 3"]:
     Raises:
         ShapeError: another number of columns. InputError: states that are not finite.
     """
+    check_tensors(states=states)
     check_shape("states", states, [None, body.dim])
     check_finite("states", states, hint="end the sequence where the recording has a gap")
-    return compose(body.centres, states[:, 3:].unflatten(-1, (-1, 3)))
+    return compose(body.centres, states[:, 3:].to(body.centres).unflatten(-1, (-1, 3)))
 
 
 def edge_rotations(

@@ -169,8 +169,8 @@ def fit_gplvm_noise(
         The same manifold, changed.
 
     Raises:
-        InputError: fewer than 10 frames, NaN, a frame rate that is not positive, or frames that
-            were fitted to. ShapeError: other columns.
+        InputError: fewer than 10 frames, NaN, no motion, a frame rate that is not positive, or a
+            sequence that starts with a frame that was fitted to. ShapeError: other columns.
     """
     check_rate("fps", fps)
     joined, lengths = join_sequences(poses, manifold.info.columns, manifold.dim)
@@ -178,6 +178,10 @@ def fit_gplvm_noise(
     check_unseen(joined, lengths, manifold.poses)
     latents = manifold.to_latent(joined)
     noise = motion_noise(joined, latents, manifold.pose_mean(latents), lengths)
+    if not bool((noise.std_step > 0).all()):
+        raise InputError(
+            "the standard deviations need poses that move, got the same one in all frames of each sequence"
+        )
     for name, value in noise._asdict().items():
         getattr(manifold, name).copy_(value)
     growth = {"latent": steps_growth(latents, lengths), "step": steps_growth(joined, lengths)}

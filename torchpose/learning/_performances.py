@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape, check_tensors
 from torchpose.errors import InputError
 from torchpose.priors._actions.action_file import Synchronised
 
@@ -74,6 +74,8 @@ def checked_performances(performances: Sequence[Float[Tensor, "_ R"]]) -> list[T
     """
     if not len(performances):
         raise InputError("expected performances of an action, got none")
+    for number, part in enumerate(performances):
+        check_tensors(**{f"performance {number}": part})
     columns = performances[0].shape[-1] if performances[0].ndim else 0
     for number, part in enumerate(performances):
         check_shape(f"performance {number}", part, ["T", columns])

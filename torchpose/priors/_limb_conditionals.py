@@ -14,7 +14,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_finite, check_rate, check_shape
+from torchpose._core.checks import (
+    check_choice,
+    check_finite,
+    check_rate,
+    check_shape,
+    check_tensors,
+)
 from torchpose._core.module_state import NoHalfModule, derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
@@ -350,10 +356,15 @@ def in_body_frame(
         ``other.altered(frame="body", centres=body.centres)``.
 
     Raises:
-        InputError: nobody, or no states. SkeletonError: bodies of different skeletons.
+        InputError: nobody, or no states. ShapeError: states that are not [T, D]. SkeletonError: bodies of
+            different skeletons.
     """
     if not persons or not any(len(states) for _, several in persons for states in several):
         raise InputError("expected recorded states of at least one person, got none")
+    for own, several in persons:
+        for states in several:
+            check_tensors(states=states)
+            check_shape("states", states, ["T", own.dim])
     plain = persons[0][0].altered(frame="body", centres=torch.zeros_like(persons[0][0].centres))
     sequences = [own.convert(states, plain) for own, several in persons for states in several]
     body = plain.altered(centres=centres_of(plain, torch.cat(sequences)))

@@ -63,3 +63,7 @@ def test_too_few_frames_or_no_rate():
         constant_velocity_std(BODY, torch.zeros(2, 3))
     with pytest.raises(InputError, match="target_fps must be positive"):
         constant_velocity_std(BODY, torch.zeros(9, 3), 30.0, 0.0)
+    with pytest.raises(InputError, match="target_fps=15 needs the frame rate of the sequences"):
+        constant_velocity_std(BODY, torch.zeros(9, 3), target_fps=15.0)
+    with pytest.raises(InputError, match="velocity_rate must be from 0 to below 1, got 2"):
+        constant_velocity_std(BODY, torch.zeros(9, 3), velocity_rate=2)

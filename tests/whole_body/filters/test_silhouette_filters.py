@@ -557,8 +557,11 @@ def test_motion_std_is_the_change_from_frame_to_frame():
     assert motion_std(LinearBody(2), torch.zeros(3, 2), floor=0.1).tolist() == pytest.approx(
         [0.1] * 2
     )
-    with pytest.raises(InputError, match="follow each other"):
-        motion_std(LinearBody(2), states[:1])
+    for none in (states[:1], []):
+        with pytest.raises(InputError, match="follow each other"):
+            motion_std(LinearBody(2), none)
+    with pytest.raises(InputError, match="states must be a tensor, got ndarray"):
+        motion_std(LinearBody(2), states.numpy())
 
 
 # --- bad input
@@ -611,7 +614,7 @@ def test_inputs_that_are_refused():
     tracker = SIRParticleFilter(body, 5)
     with pytest.raises(InputError, match="precision of SIRParticleFilter"):
         tracker.half()
-    with pytest.raises(InputError, match="body must be a torchpose.body.Body, .* got str"):
+    with pytest.raises(InputError, match=r"body must be a torchpose.body.Body, .* got str"):
         SIRParticleFilter("walker")
     for given, start, said in (
         (masks.numpy(), torch.zeros(3), "silhouettes must be a tensor, got ndarray"),

@@ -322,11 +322,12 @@ class ActionSpace(NoHalfModule):
             `Acceptance`, three shares from 0 to 1.
 
         Raises:
-            InputError: no posture. ShapeError: other than 36 angles.
+            InputError: no posture, or one that is not finite. ShapeError: other than 36 angles.
         """
         z = self.project(postures)
         if len(z) == 0:
             raise InputError("an acceptance needs at least one posture, got none")
+        check_finite("postures", postures, hint="leave out the frames with missing joints")
         somewhere = passes_any_gate(z, self.performance, self.std, width)
         return Acceptance(
             float(self.inside(z, self.match(z, generator), width).double().mean()),

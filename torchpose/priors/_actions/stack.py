@@ -29,6 +29,9 @@ def stack_spaces(spaces: Sequence[ActionSpace], background: float) -> dict[str, 
 
 def names_of(spaces: Sequence[ActionSpace]) -> tuple[str, ...]:
     """Return the names of the actions, or raise `InputError` unless each has one of its own."""
+    others = [type(space).__name__ for space in spaces if not isinstance(space, ActionSpace)]
+    if others:
+        raise InputError(f"a bank is made of a list of ActionSpace, got {', '.join(others)}")
     names = tuple(space.info.name for space in spaces)
     if not names:
         raise InputError("a bank needs at least one action space, got none")

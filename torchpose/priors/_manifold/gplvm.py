@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape, check_tensors
 from torchpose._core.module_state import NoHalfModule
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
@@ -67,10 +67,15 @@ def join_sequences(
         ShapeError: not [T, Q], or another number of columns. InputError: no sequence, fewer than 10
             frames in all, or a value that is not finite.
     """
-    parts = [poses] if isinstance(poses, Tensor) else list(poses)
-    wanted = dim if dim is not None else next((p.shape[-1] for p in parts if p.ndim == 2), None)
+    parts: list[Any] = [poses] if hasattr(poses, "shape") else list(poses)
+    wanted = (
+        dim
+        if dim is not None
+        else next((p.shape[-1] for p in parts if getattr(p, "ndim", 0) == 2), None)
+    )
     for number, part in enumerate(parts):
-        where = "poses" if isinstance(poses, Tensor) else f"sequence {number} of the poses"
+        where = "poses" if hasattr(poses, "shape") else f"sequence {number} of the poses"
+        check_tensors(**{where: part})
         if part.ndim != 2 or part.shape[1] != wanted:
             raise ShapeError(
                 f"{where} must have shape [T, {'Q' if wanted is None else wanted}], got "

@@ -1,13 +1,12 @@
 """Run the particle filter with action-specific posture constraints (aSpace)."""
 
-from numbers import Integral
 from typing import Any, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_positive
+from torchpose._core.checks import check_choice, check_positive, number_of
 from torchpose._core.wording import counted
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
@@ -118,7 +117,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         super().__init__(body, n_particles, **options)
         if velocity_rate is not None and not 0 <= velocity_rate < 1:
             raise InputError(f"velocity_rate must be from 0 to below 1, got {velocity_rate}")
-        if not isinstance(max_redraws, Integral) or max_redraws < 0:
+        if not number_of(max_redraws) >= 0 or max_redraws % 1:
             raise InputError(f"max_redraws must be a whole number of 0 or more, got {max_redraws}")
         check_choice("weights", weights, CONSTRAINED_WEIGHTS)
         if weights == "normalised" and isinstance(action, ActionBank):

@@ -6,12 +6,19 @@ velocity of the estimate, and has that of `constant_velocity_std`.
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_finite, check_positive, check_shape
+from torchpose._core.checks import (
+    check_finite,
+    check_positive,
+    check_shape,
+    check_tensors,
+    number_of,
+)
 from torchpose.errors import InputError
 from torchpose.whole_body._filters.body_particles import PoseSpace
 
@@ -64,8 +71,8 @@ def motion_std(
     Raises:
         InputError: no two frames that follow each other.
     """
-    sequences = [states] if isinstance(states, Tensor) else list(states)
-    steps = torch.cat([body.difference(s[1:], s[:-1]) for s in sequences])
+    changes = [body.difference(s[1:], s[:-1]) for s in _sequences(states)]
+    steps = torch.cat(changes) if changes else torch.empty(0, body.dim)
     steps = steps[torch.isfinite(steps).all(-1)]
     if len(steps) == 0:
         raise InputError("states must hold two frames that follow each other, got none")
@@ -201,11 +208,18 @@ def constant_velocity_std(
         [D], in the units of a step (`Body.perturb`), per frame of `target_fps`.
 
     Raises:
-        InputError: no three frames in a row, or a frame rate that is not positive.
+        InputError: no three frames in a row, a `velocity_rate` that is not from 0 to below 1, a
+            frame rate that is not positive, or a `target_fps` without the rate of the sequences.
 
     Reference: AS, section 3.1, after equation (3).
     """
-    states = [sequences] if isinstance(sequences, Tensor) else list(sequences)
+    if not 0 <= number_of(velocity_rate) < 1:
+        raise InputError(f"velocity_rate must be from 0 to below 1, got {velocity_rate}")
+    if fps is None and target_fps is not None:
+        raise InputError(
+            f"target_fps={target_fps:g} needs the frame rate of the sequences; give fps as well"
+        )
+    states = _sequences(sequences)
     stride, ratio = 1, 1.0
     if fps is not None and target_fps is not None:
         ratio = check_positive("fps", fps) / check_positive("target_fps", target_fps)
@@ -239,6 +253,15 @@ def rescale_std(
         "interval", interval
     )
     return std * ratio**_RATE_POWER
+
+
+def _sequences(states: Tensor | Sequence[Tensor]) -> list[Tensor]:
+    """Return one or several sequences as a list, or raise `InputError` or `ShapeError` for what are none."""
+    parts: list[Any] = [states] if hasattr(states, "shape") else list(states)
+    for part in parts:
+        check_tensors(states=part)
+        check_shape("states", part, ["T", "D"])
+    return parts
 
 
 def _errors(body: PoseSpace, states: Tensor, rate: float) -> Tensor:
