@@ -39,3 +39,7 @@ def test_bad_input() -> None:
         plot_action_space(space, steps, n_dimensions=0)
     with pytest.raises(ShapeError, match="postures and dimensions"):
         plot_action_space(space.with_dimensions(3), steps)
+    with pytest.raises(InputError, match=r"space must be of ActionSpace, from .* got str"):
+        plot_action_space("bend", steps)
+    with pytest.raises(InputError, match=r"synchronised must be of Synchronised, from .* got list"):
+        plot_action_space(space, performances(8))

@@ -69,6 +69,24 @@ def test_other_poses_and_a_body_are_drawn_too(manifold, body, tmp_path) -> None:
     assert len(bones) == 5 * (len(BODY_15.names) - 1)
 
 
+def test_a_cycle_of_few_frames_shows_each_pose_once(body) -> None:
+    few = fit_gplvm(motion(60)[::12].repeat(2, 1), steps=1)  # five frames to a cycle
+    figure = plot_manifold(few, body=body, n_poses=8, resolution=10)
+    numbers = [text.get_text() for text in figure.axes[1].texts]
+    shown = int(numbers[-1])
+    assert shown < 8 and numbers == [str(i + 1) for i in range(shown)]
+    places = {text.xy for text in figure.axes[0].texts if text.get_text() in numbers}
+    assert len(places) == shown
+
+
+def test_names_that_share_a_colour_have_other_marks() -> None:
+    info = ManifoldInfo(name="many", sequences=tuple("abcdefghi"))
+    many = fit_gplvm([motion(5, seed=i) for i in range(9)], steps=1, info=info)
+    legend = plot_manifold(many, resolution=10).figure.legends[0]
+    looks = {(line.get_color(), line.get_marker()) for line in legend.get_lines()}
+    assert len(looks) == 9
+
+
 def test_what_cannot_be_drawn_is_refused(manifold, body) -> None:
     one = fit_gplvm(motion(30), latent_dim=1, steps=1)
     with pytest.raises(InputError, match="needs two dimensions or more, got 1"):
@@ -79,6 +97,17 @@ def test_what_cannot_be_drawn_is_refused(manifold, body) -> None:
         plot_manifold(manifold, body=body.altered(frame="body"))
     with pytest.raises(ShapeError, match="x must have shape"):
         plot_manifold(manifold, {"other": torch.zeros(5, 7)})
+    for bad in ("walk", manifold.poses):
+        with pytest.raises(InputError, match="manifold must be a BackConstrainedGPLVM, got"):
+            plot_manifold(bad)
+    with pytest.raises(InputError, match="others must go by names"):
+        plot_manifold(manifold, motion(9))
+    with pytest.raises(InputError, match=r"others\['held out'\] must be a tensor, got ndarray"):
+        plot_manifold(manifold, {"held out": motion(9).numpy()})
+    with pytest.raises(InputError, match="leave out the frames with gaps"):
+        plot_manifold(manifold, {"held out": motion(9) * torch.nan})
+    with pytest.raises(InputError, match="body must be a torch"):
+        plot_manifold(manifold, body=1.8)
 
 
 def test_more_than_two_dimensions_show_the_first_two() -> None:

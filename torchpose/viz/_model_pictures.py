@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import check_count
+from torchpose._core.checks import check_count, check_finite, check_tensors
+from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, ShapeError
+from torchpose.priors._actions.action_file import Synchronised
+from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.viz._style import (
     INK,
     LEFT,
@@ -19,6 +23,7 @@ from torchpose.viz._style import (
     SIDE_COLORS,
     SMALL,
     add_legend,
+    check_named,
     legend_line,
     method_styles,
     new_figure,
@@ -30,15 +35,10 @@ from torchpose.viz._style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from torchpose.body._kinematics import Body
-    from torchpose.priors._actions.action_file import Synchronised
-    from torchpose.priors._actions.space import ActionSpace
-    from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 else:
-    Axes = Figure = ActionSpace = BackConstrainedGPLVM = Body = Synchronised = Any
+    Axes = Figure = Any
 
-_MARGIN, _ARROWS = 0.18, 5
+_MARGIN, _ARROWS, _MARKS = 0.18, 5, "osD^v"
 _SIDE, _UP = 2, 1  # part axes: z forward, y up
 
 
@@ -52,15 +52,16 @@ def plot_manifold(
 ) -> Figure:
     """Return the first two latent dimensions, the trajectories in them, and the predictive deviation.
 
-    The predictive deviation is least where the picture is white; where it is dark the manifold predicts
-    the mean pose. A line is a sequence, with arrows in the direction of time and a dot at its start.
-    Sequences of one name share a colour. With a body, poses along the first sequence are drawn below,
-    seen from the side and facing right; their numbers are in the latent space as well.
+    The predictive deviation is least where the picture is lightest; where it is dark the manifold predicts
+    the mean pose. A line is a sequence, with arrows in the direction of time and a mark at its start.
+    Sequences of one name share colour and mark. With a body, poses along the first sequence are drawn
+    below, seen from the side and facing right; their numbers are in the latent space as well.
 
     Args:
         manifold: of two latent dimensions or more; the others are held at zero.
         others: more poses by name, such as of a validation trial, drawn dashed.
-        body: whose states the poses are of. n_poses: the number of poses that are shown of it.
+        body: whose states the poses are of. n_poses: the number of poses that are shown of it, at most one
+            for each frame.
         resolution: points of the grey picture along either axis.
         title: above the picture; by default the manifold's name and size.
 
@@ -68,11 +69,19 @@ def plot_manifold(
         matplotlib `Figure`.
 
     Raises:
-        InputError: one latent dimension only, or fewer than two points or poses asked for.
-        PriorError: a body of another skeleton. ShapeError: poses with other columns.
+        InputError: no manifold, one of one latent dimension only, other poses that are not finite or go by
+            no names, or fewer than two points or poses asked for. PriorError: a body of another skeleton.
+            ShapeError: poses with other columns.
 
     Reference: Gonczarek & Tomczak, Figure 5.
     """
+    if not isinstance(manifold, BackConstrainedGPLVM):
+        raise InputError(
+            f"manifold must be a BackConstrainedGPLVM, got {type(manifold).__name__}; load_manifold reads "
+            "one from a file"
+        )
+    others = {} if others is None else others
+    check_named("others", others, '{"held out": poses}')
     if manifold.latent_dim < 2:
         raise InputError("a picture of the latent space needs two dimensions or more, got 1")
     if resolution < 2 or n_poses < 2:
@@ -80,9 +89,11 @@ def plot_manifold(
             f"resolution and n_poses must be at least 2, got {resolution} and {n_poses}"
         )
     if body is not None:
+        if not isinstance(body, Body):
+            raise InputError(f"body must be a torchpose.body.Body, got {type(body).__name__}")
         manifold.check_for(body)
     fitted = _by_name(manifold)
-    watched = {name: _latents(manifold, poses) for name, poses in (others or {}).items()}
+    watched = {name: _latents(manifold, name, poses) for name, poses in others.items()}
     everything = torch.cat(
         [z[:, :2] for paths in (fitted, watched) for p in paths.values() for z in p]
     )
@@ -96,15 +107,12 @@ def plot_manifold(
         _number(ax, places)
     style_axes(ax, "first latent dimension", "second latent dimension", grid=False)
     _draw_deviation(ax, manifold, everything, resolution)
-    styles = method_styles([*fitted, *watched])
-    for name, paths in fitted.items():
+    styles = _path_styles(fitted, watched)
+    for name, paths in [*fitted.items(), *watched.items()]:
         for path in paths:
-            _draw_path(ax, path, styles[name]["color"], "-")
-    for name, paths in watched.items():
-        for path in paths:
-            _draw_path(ax, path, styles[name]["color"], (0, (4, 1.5)), hollow=True)
+            _draw_path(ax, path, styles[name])
     ax.set_aspect("equal")
-    add_legend(figure, _legend(fitted, watched, styles))
+    add_legend(figure, [legend_line(name, **style) for name, style in styles.items()])
     return figure
 
 
@@ -124,8 +132,11 @@ def _by_name(manifold: BackConstrainedGPLVM) -> dict[str, list[Tensor]]:
     return found
 
 
-def _latents(manifold: BackConstrainedGPLVM, poses: Tensor | Sequence[Tensor]) -> list[Tensor]:
-    parts = [poses] if isinstance(poses, Tensor) else list(poses)
+def _latents(manifold: BackConstrainedGPLVM, name: str, poses: Any) -> list[Tensor]:
+    parts = [poses] if hasattr(poses, "shape") else list(poses)
+    for part in parts:
+        check_tensors(**{f"others[{name!r}]": part})
+        check_finite(f"others[{name!r}]", part, hint="leave out the frames with gaps")
     return [manifold.to_latent(part.to(manifold.poses)).detach().cpu() for part in parts]
 
 
@@ -148,18 +159,33 @@ def _draw_deviation(
     )  # fmt: skip
     bar = ax.figure.colorbar(image, ax=ax, shrink=0.7, pad=0.02)
     bar.ax.set_ylim(float(deviation.min()), float(deviation.max()))
-    bar.set_label("standard deviation of a column of the pose", fontsize=SMALL, color=INK)
+    unit = " (sines of half angles)" if manifold.info.skeleton else ""
+    bar.set_label(f"standard deviation of a column{unit}", fontsize=SMALL, color=INK)
     bar.ax.tick_params(labelsize=SMALL, colors=MUTED, length=3)
     bar.outline.set_edgecolor(PALE)
 
 
-def _draw_path(ax: Axes, path: Tensor, color: str, dashes: Any, hollow: bool = False) -> None:
-    x, y = to_numpy(path[:, 0]), to_numpy(path[:, 1])
-    ax.plot(x, y, color=color, linestyle=dashes, linewidth=1.3, alpha=0.9)
-    ax.plot(
-        x[:1], y[:1], color=color, marker="o", markersize=7, linestyle="", markeredgewidth=1.6,
-        markerfacecolor="white" if hollow else color,
-    )  # fmt: skip
+def _path_styles(
+    fitted: Mapping[str, Any], watched: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Return how the sequences of each name are drawn: where colours come again, marks are others."""
+    marked: dict[str, list[str]] = {}
+    styles = {}
+    for name, style in method_styles([*fitted, *watched]).items():
+        alike = marked.setdefault(style["color"], [])
+        alike.append(name)
+        styles[name] = {
+            "color": style["color"], "linestyle": "-" if name in fitted else (0, (4, 1.5)),
+            "linewidth": 1.3, "marker": _MARKS[(len(alike) - 1) % len(_MARKS)], "markersize": 7,
+            "markeredgewidth": 1.6, "markerfacecolor": style["color"] if name in fitted else "white",
+        }  # fmt: skip
+    return styles
+
+
+def _draw_path(ax: Axes, path: Tensor, style: Mapping[str, Any]) -> None:
+    x, y, color = to_numpy(path[:, 0]), to_numpy(path[:, 1]), style["color"]
+    ax.plot(x, y, **{**style, "marker": "", "alpha": 0.9})
+    ax.plot(x[:1], y[:1], **{**style, "linestyle": ""})
     for i in range(_ARROWS):
         at = round((i + 0.5) / _ARROWS * (len(x) - 2))
         if len(x) > 2 and (x[at] != x[at + 1] or y[at] != y[at + 1]):
@@ -173,7 +199,8 @@ def _draw_poses(part: Any, manifold: BackConstrainedGPLVM, body: Body, n_poses: 
     """Draw poses along the first sequence, beside each other; return their latent points."""
     path = manifold.trajectories()[0]
     cycle = path[: _cycle(path)]
-    at = torch.linspace(0, len(cycle) - 1, n_poses + 1)[:-1].round().long()
+    n_poses = min(n_poses, len(cycle))
+    at = torch.arange(n_poses) * len(cycle) // n_poses
     with torch.no_grad():
         poses = manifold.pose_mean(cycle[at]).detach().cpu().double()
     rest = torch.zeros(n_poses, body.dim, dtype=torch.float64)
@@ -221,20 +248,6 @@ def _number(ax: Axes, places: Tensor) -> None:
         )  # fmt: skip
 
 
-def _legend(
-    fitted: Mapping[str, Any], watched: Mapping[str, Any], styles: Mapping[str, dict[str, Any]]
-) -> list[Any]:
-    def entry(name: str, dashes: Any, face: str | None) -> Any:
-        color = styles[name]["color"]
-        return legend_line(
-            name, color, linestyle=dashes, linewidth=1.3, marker="o", markersize=6,
-            markerfacecolor=face or color,
-        )  # fmt: skip
-
-    entries = [entry(name, "-", None) for name in fitted]
-    return entries + [entry(name, (0, (4, 1.5)), "white") for name in watched]
-
-
 _MOST_LINES = 60
 
 
@@ -251,7 +264,8 @@ def plot_action_space(
     either side of it; upright lines stand at the key frames.
 
     Args:
-        space: the fitted action. synchronised: its performances, of `fit_synchronised`.
+        space: the fitted action. synchronised: its performances in step, which
+            `torchpose.learning.fit_actions` has beside it, in ``spaces[action]`` of its result.
         n_dimensions: that are shown, as many as there are at most. deviations: of the dashed lines.
         title: above the picture; by default the action's name and size.
 
@@ -259,11 +273,20 @@ def plot_action_space(
         matplotlib `Figure`, a panel for each dimension.
 
     Raises:
-        InputError: no dimension is asked for. ShapeError: performances of another action space.
+        InputError: no action space, no synchronised performances, or no dimension is asked for.
+            ShapeError: performances of another action space.
 
     Reference: Rius, Varona, Roca & Gonzalez, 2006, Figure 1.
     """
     check_count("n_dimensions", n_dimensions)
+    for name, value, kind in (
+        ("space", space, ActionSpace), ("synchronised", synchronised, Synchronised)
+    ):  # fmt: skip
+        if not isinstance(value, kind):
+            raise InputError(
+                f"{name} must be of {kind.__name__}, from torchpose.learning.fit_actions, got "
+                f"{type(value).__name__}"
+            )
     if synchronised.after.shape[1:] != space.performance.shape:
         raise ShapeError(
             f"the performances have {list(synchronised.after.shape[1:])} postures and dimensions, the "
