@@ -14,11 +14,15 @@ import pytest
 import torch
 
 from tests.upper_body.test_bvh import track_of as of_joints
+from torchpose.body import BODY_15, Body
+from torchpose.body._feet import FEET
+from torchpose.camera import PinholeCamera
 from torchpose.demo import performer
 from torchpose.errors import InputError, OutputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.viz._report import packing, page, write_report
+from torchpose.whole_body import BodyTrack
 
 HOSTILE = (
     "</script><script>alert(1)</script><img src=x onerror=alert(2)> & \"quotes\" 'too' {{data}}"
@@ -95,6 +99,34 @@ def test_names_of_a_whole_body_begin_with_the_side_too(tmp_path):
     data = read(tmp_path / "a.html").data
     assert data["names"][:5] == ["left wrist", "right upper arm", "neck", "left knee", "mid hip"]
     assert data["sides"][:5] == ["left", "right", "middle", "left", "middle"]
+
+
+def test_a_body_has_its_own_bones(tmp_path):
+    body = Body.of_height(BODY_15, 1.75)
+    state = torch.zeros(2, body.dim).double()
+    nothing = torch.zeros(2).double()
+    track = BodyTrack(
+        body, state, state, body.joints(state), torch.zeros(2, 15, 3, 3).double(), nothing,
+        nothing, nothing > 0, nothing > 0,
+    )  # fmt: skip
+    seen = track.seen_by(PinholeCamera(80, 80, 39.5, 29.5, 80, 60))
+    limbs = read(write_report(tmp_path / "a.html", [seen])).data["limbs"]
+    pairs = {(BODY_15.names[a], BODY_15.names[b]) for a, b in limbs}
+    assert len(limbs) == 14 and {("pelvis", "left_hip"), ("left_elbow", "left_wrist")} <= pairs
+    feet = replace(
+        seen, names=(*seen.names, *FEET), joints3d=torch.zeros(1, 2, 21, 3),
+        covariance3d=torch.zeros(1, 2, 21, 3, 3), observed=torch.ones(1, 2, 21).bool(),
+    )  # fmt: skip
+    assert len(read(write_report(tmp_path / "b.html", [feet])).data["limbs"]) == 14 + 8
+    other = replace(seen, names=seen.names[::-1])
+    for people, limbs, said in (
+        ([track], None, "give track.seen_by"),
+        ([other], None, "limbs must be given for the joints right_ankle"),
+        ([seen], [(0, 15)], "limbs must be of joints 0 to 14"),
+        ([seen, other], None, "must be of the same joints"),
+    ):
+        with pytest.raises(InputError, match=said):
+            write_report(tmp_path / "c.html", people, limbs=limbs)
 
 
 def test_it_needs_no_network(tmp_path):
@@ -265,34 +297,62 @@ def test_the_templates_are_part_of_the_package():
     assert UPPER_BODY[0] not in template
 
 
-_VALUES = """
+_PAGE = """
 const elements = {};
 const document = { getElementById(id) {
   return elements[id] ??= { textContent: id === "data" ? process.argv[2] : "" };
 } };
 const getComputedStyle = () => ({ getPropertyValue: () => "" });
 SCRIPTS
+"""
+_VALUES = (
+    _PAGE
+    + """
 writeValues();
 console.log($("curve-values").textContent);
 """
+)
+_ELLIPSOIDS = (
+    _PAGE
+    + """
+console.log(data.names.map((_, j) => hasEllipsoid(people[0], 0, j)).join(" "));
+"""
+)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 0.0])
 def test_a_joint_of_unknown_deviation_is_shown_with_a_question_mark(tmp_path, value):
+    track = track_of(3)
+    track.covariance3d[:] = value
+    said = run_in_node(track, _VALUES, tmp_path)
+    assert said.count("± ?" if value else "± 0.0") == 3, said
+
+
+@pytest.mark.parametrize("outlined", [True, False])
+def test_ellipsoids_are_of_inferred_joints_or_of_all_that_outlines_measure(tmp_path, outlined):
+    track = track_of(3)
+    track.observed[:] = True
+    if not outlined:
+        track.observed[:, 0, 2:] = False
+    said = run_in_node(track, _ELLIPSOIDS, tmp_path).split()
+    inferred = (~track.observed[0, 0]).tolist()
+    assert said == ["true" if outlined or there else "false" for there in inferred]
+
+
+def run_in_node(track, program, folder):
+    """Return what a program prints that knows the scripts of the page of a track."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not on the PATH")
-    track = track_of(3)
-    track.covariance3d[:] = value
-    data = read(write_report(tmp_path / "a.html", [track])).by_id["data"]
+    data = read(write_report(folder / "a.html", [track])).by_id["data"]
     scripts = [files("torchpose.viz._report").joinpath(name).read_text(encoding="utf-8")
                for name in ("numbers.js", "plots.js", "player.js")]  # fmt: skip
-    code = _VALUES.replace("SCRIPTS", "\n".join(scripts).replace("\nsetUp();\n", "\n"))
-    (tmp_path / "values.js").write_text(code, encoding="utf-8")
-    command = [node, str(tmp_path / "values.js"), data]
+    code = program.replace("SCRIPTS", "\n".join(scripts).replace("\nsetUp();\n", "\n"))
+    (folder / "program.js").write_text(code, encoding="utf-8")
+    command = [node, str(folder / "program.js"), data]
     run = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=60)
     assert run.returncode == 0, run.stderr
-    assert run.stdout.count("± ?" if value else "± 0.0") == 3, run.stdout
+    return run.stdout
 
 
 _PROBE = """<script>

@@ -165,12 +165,9 @@ def write_page(
     camera: "PinholeCamera", people: "Sequence[BodyTrack]", facts: dict[str, str], out: Path
 ) -> list[Path]:
     """Write the page with the first camera's overlay, if there is one, the skeletons and curves."""
-    from torchpose.body._feet import FOOT_BONES
     from torchpose.viz._report.page import write_report
 
     overlay = out / overlay_name(camera.name)
-    bones = [(p, j) for j, p in enumerate(people[0].body.skeleton.parents) if p >= 0]
-    bones += FOOT_BONES if people[0].feet is not None else ()
     first, end = span_of(people)
     late = [f"frame 0 of this page is frame {first} of the recording"] if first else []
     page = write_report(
@@ -178,7 +175,7 @@ def write_page(
         overlay=overlay if overlay.exists() else None,
         title="Tracked body" if len(people) == 1 else "Tracked bodies", facts=facts,
         notes=[*late, *_notes_of(people)], first_frames=[poses.first_frame - first for poses in people],
-        n_frames=end - first, limbs=bones,
+        n_frames=end - first,
     )  # fmt: skip
     return [page]
 

@@ -262,7 +262,7 @@ class BodyTrack:
         write_body_file(path, motion, up)
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
-        """Return the joints in a camera's axes, and those of feet, for `torchpose.viz._report.write_report`.
+        """Return the joints in a camera's axes, and those of feet, for `torchpose.viz.write_report`.
 
         Args:
             camera: with a pose in the room.

@@ -40,6 +40,10 @@ const isThere = (p, i) => !p.there || p.there[i] === 1;
 const isMeasured = (p, i, joint) =>
   ((p.observed[i * OBSERVED_BYTES + (joint >> 3)] >> (joint & 7)) & 1) === 1;
 
+/** Whether an ellipsoid is drawn: of inferred joints, and of all where outlines measure them together. */
+const hasEllipsoid = (p, i, joint) =>
+  p.measured.every((share) => share === p.measured[0]) || !isMeasured(p, i, joint);
+
 /** Numbers of a person at a frame of the video, evenly between kept poses; null where none is. */
 function at(p, values, width, frame) {
   const i = frame - p.first;

@@ -17,6 +17,8 @@ from torch import Tensor
 from torchpose._core.checks import check_shape
 from torchpose._core.files import atomic_path
 from torchpose._core.reading import require_file
+from torchpose.body._feet import FEET, FOOT_BONES
+from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS
@@ -49,7 +51,7 @@ def write_report(
     n_frames: int | None = None,
     labels: Sequence[str] | None = None,
     truth: Tensor | None = None,
-    limbs: Sequence[tuple[int, int]] = LIMBS,
+    limbs: Sequence[tuple[int, int]] | None = None,
 ) -> Path:
     """Write tracked poses as one HTML page that any browser shows, without a network.
 
@@ -59,8 +61,9 @@ def write_report(
 
     Args:
         path: the page; it appears whole or not at all.
-        people: one `PoseTrack` of one sequence for each person, or the like with other joints; an
-            empty list gives a page without persons. NaN poses are not drawn.
+        people: one `PoseTrack` of one sequence for each person, ``track.seen_by(camera)`` of a `BodyTrack`,
+            or the like with other joints; an empty list gives a page without persons. NaN poses are not
+            drawn.
         overlay: video for the page, H.264; up to 64 MB it is embedded, a larger one is linked.
             Without it the page plays the skeleton alone.
         title: the title of the page. facts: rows of a table, such as video, camera, method.
@@ -69,14 +72,14 @@ def write_report(
         n_frames: frames of the video; by default up to the end of the last track.
         labels: name of each person; by default "person 1" and so on.
         truth: true joints of the first person [T, J, 3], metres, in the axes of its track.
-        limbs: pairs of joints that a line joins.
+        limbs: pairs of joints that a line joins; by default those of the upper body, or of a `BodyTrack`.
 
     Returns:
         `path`.
 
     Raises:
         InputError: a track in place of a list, one of several sequences or none, counts that do not match,
-            no such overlay.
+            other joints without limbs, limbs of joints that there are not, no such overlay.
         ShapeError: truth of another shape. OutputError: the page cannot be written.
     """
     path = Path(path)
@@ -87,6 +90,7 @@ def write_report(
     starts = [0] * len(people) if first_frames is None else list(first_frames)
     names = [f"person {i + 1}" for i in range(len(people))] if labels is None else list(labels)
     _check(people, starts, names, truth)
+    limbs = _limbs(people[0].names if people else UPPER_BODY, limbs)
     fps, more = _frame_rate(people)
     end = max((start + track.joints3d.shape[1] for start, track in zip(starts, people, strict=True)),
               default=0)  # fmt: skip
@@ -177,6 +181,27 @@ def _data(
 
 def _template(name: str) -> str:
     return files("torchpose.viz._report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _limbs(
+    names: Sequence[str], given: Sequence[tuple[int, int]] | None
+) -> Sequence[tuple[int, int]]:
+    """Return the pairs of joints that a line joins, those of the joints by default."""
+    if given is not None:
+        if not all(0 <= joint < len(names) for pair in given for joint in pair):
+            raise InputError(
+                f"limbs must be of joints 0 to {len(names) - 1}, got {list(given)!s:.80}"
+            )
+        return given
+    if len(names) == len(UPPER_BODY):
+        return LIMBS
+    bones = [(parent, joint) for joint, parent in enumerate(BODY_15.parents) if parent >= 0]
+    known = {BODY_15.names: bones, (*BODY_15.names, *FEET): [*bones, *FOOT_BONES]}
+    if tuple(names) not in known:
+        raise InputError(
+            f"limbs must be given for the joints {', '.join(names)!s:.80}, pairs of their places"
+        )
+    return known[tuple(names)]
 
 
 # --- words ----------------------------------------------------------------------------------------
@@ -279,6 +304,11 @@ def _check(
     for i, track in enumerate(people):
         if not hasattr(track, "joints3d"):
             raise InputError(f"people[{i}] must be a PoseTrack, got {type(track).__name__}")
+        if hasattr(track, "seen_by"):
+            raise InputError(
+                f"people[{i}] must be poses in the axes of a camera, got {type(track).__name__}; give "
+                "track.seen_by(camera)"
+            )
         if len(track) != 1 or track.joints3d.shape[1] == 0:
             raise InputError(
                 f"people[{i}] must be one sequence of at least one frame, got joints3d of shape "
@@ -289,6 +319,8 @@ def _check(
             raise InputError(f"expected {name} for {len(people)} persons, got {len(given)}")
     if any(start < 0 for start in starts):
         raise InputError(f"first_frames must not be negative, got {list(starts)}")
+    if len({tuple(track.names) for track in people}) > 1:
+        raise InputError("poses of all persons must be of the same joints, got some of others")
     if len({track.frame for track in people}) > 1:
         raise InputError("poses of all persons must be in one frame, got camera and body")
     if truth is not None:

@@ -193,7 +193,7 @@ function drawBody() {
     if (covariance) {
       data.names.forEach((_, j) => {
         const point = corner(joints, j);
-        if (!isMeasured(p, state.frame - p.first, j) && finite(point)) {
+        if (hasEllipsoid(p, state.frame - p.first, j) && finite(point)) {
           drawEllipsoid(ctx, camera, point, covariance.subarray(6 * j, 6 * j + 6), jointColor(j));
         }
       });
