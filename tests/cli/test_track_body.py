@@ -196,8 +196,20 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
                 writer.write(np.ascontiguousarray(empty))
         line[2 + i] = str(path)
     assert main(line) == 1
-    assert "nobody was seen" in capsys.readouterr().err
+    assert (
+        "no poses: nobody is seen by all cameras in any frame, and by front, left, behind in none"
+        in (capsys.readouterr().err)
+    )
     assert not (tmp_path / "body.npz").exists()
+
+
+def test_a_video_that_ends_before_the_others_is_noted(recorded, tmp_path):
+    folder = recorded[0]
+    cameras = list(load_cameras(folder / "cameras.toml").values())
+    videos = [str(folder / f"{camera.name}.mp4") for camera in cameras]
+    with Recordings(videos, cameras, 60, delays=[0, 3, 1]) as late:
+        (note,) = late.notes
+    assert f"left.mp4 ends after {N - 3} frames and others after up to {N}" in note
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import BODY_15, Body
-from torchpose.errors import InputError, NobodySeenError, PriorError, ShapeError
+from torchpose.errors import CameraError, InputError, NobodySeenError, PriorError, ShapeError
 from torchpose.learning import fit_limb_conditionals
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import (
@@ -27,7 +27,7 @@ from torchpose.whole_body import (
 )
 from torchpose.whole_body._filter_table import BodyTrackerOptions, choose_method, method_options
 from torchpose.whole_body._filters.body_particles import BodyFilterOptions
-from torchpose.whole_body._following import all_see
+from torchpose.whole_body._following import which_see
 
 
 @pytest.fixture(scope="module")
@@ -160,11 +160,20 @@ def test_results_keep_their_method_in_a_file(scene, tmp_path):
 def test_a_frame_counts_if_every_camera_sees_somebody():
     seen = torch.zeros(2, 10, 40, dtype=torch.bool)
     seen[0, 0, 0] = True
-    assert not all_see(seen)
+    assert which_see(seen).tolist() == [True, False]
     seen[1, 0, 0] = True
-    assert all_see(seen)  # 1 of 400 pixels
-    with pytest.raises(NobodySeenError):
-        BodyTracker(rig())(torch.zeros(3, 3, HEIGHT, WIDTH, dtype=torch.bool))
+    assert which_see(seen).all()  # 1 of 400 pixels
+    frames = torch.zeros(3, 3, HEIGHT, WIDTH, dtype=torch.bool)
+    with pytest.raises(NobodySeenError, match="and by c0, c1, c2 in none; check"):
+        BodyTracker(rig())(frames)
+    frames[0, 0] = frames[1, 2] = True
+    with pytest.raises(NobodySeenError, match="and by c1 in none; check"):
+        BodyTracker(rig())(frames)
+    frames[2, 1] = True
+    with pytest.raises(NobodySeenError, match="in any frame; check"):
+        BodyTracker(rig())(frames)
+    with pytest.raises(CameraError, match="must be of 3 cameras"):
+        BodyTracker(rig())(frames[:, :2])
 
 
 @pytest.mark.parametrize(

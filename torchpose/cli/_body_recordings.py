@@ -65,6 +65,7 @@ class Recordings:
         self.packed: list[Any] = []
         self.notes: list[str] = [note for _, notes in fitted for note in notes]
         self._check_delays()
+        self.notes += self._note_on_lengths()
 
     def __enter__(self) -> "Recordings":
         return self
@@ -179,6 +180,22 @@ class Recordings:
                     f"--delays must be from 0 to below the number of frames, got {delay} for {path}"
                     + ("" if count is None else f", which has {count}")
                 )
+
+    def _note_on_lengths(self) -> list[str]:
+        """Note that frames of longer videos are left out, which only some of the cameras have."""
+        from torchpose._core.wording import counted
+
+        pairs = zip(self.sources, self._delays, strict=True)
+        counts = [None if s.n_frames is None else s.n_frames - delay for s, delay in pairs]
+        known = [count for count in counts if count is not None]
+        if len(set(known)) < 2:
+            return []
+        least, most = min(known), max(known)
+        path = self.videos[counts.index(least)]
+        return [
+            f"{path} ends after {counted(least, 'frame')} and others after up to {most}: what only some of "
+            "the cameras have is not tracked"
+        ]
 
     def _open(self) -> "list[VideoSource]":
         from torchpose.video._source import open_video

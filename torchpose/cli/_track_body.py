@@ -235,12 +235,17 @@ def _run_on_silhouettes(
         ) as recordings:
             start = time.perf_counter()
             body_tracker = _tracker(recordings, values["method"], tracker, options)
-            poses = _track(
-                recordings, body_tracker, values["initial_pose"], values["facing"], values["seed"]
-            )
+            try:
+                poses = _track(
+                    recordings,
+                    body_tracker,
+                    values["initial_pose"],
+                    values["facing"],
+                    values["seed"],
+                )
+            except NobodySeenError as error:
+                return report_nobody(str(error), results.folder)
             seconds = time.perf_counter() - start
-            if poses is None:
-                return report_nobody("nobody was seen by all cameras", results.folder)
             written = results.commit(write_people(job, results.stage, [poses]))
             shown: list[Path] = []
             if job.overlay or job.pictures:
@@ -375,8 +380,8 @@ def _track(
     initial_pose: str | None,
     facing: list[float] | None,
     seed: int,
-) -> "BodyTrack | None":
-    """Find the person, then track; return None if there is nobody."""
+) -> "BodyTrack":
+    """Find the person, then track; raise `NobodySeenError` if there is nobody."""
     import torch
 
     from torchpose.cli._track_body_keypoints import first_state
@@ -386,11 +391,8 @@ def _track(
     direction = None if facing is None else torch.tensor(facing, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     with gate_is_in_a_note():
-        try:
-            poses = tracker(
-                frames, start, generator=generator, facing=direction, n_frames=recordings.n_frames,
-                progress=show_progress(),
-            )  # fmt: skip
-        except NobodySeenError:
-            return None
+        poses = tracker(
+            frames, start, generator=generator, facing=direction, n_frames=recordings.n_frames,
+            progress=show_progress(),
+        )  # fmt: skip
     return replace(poses, notes=(*recordings.all_notes, *poses.notes))

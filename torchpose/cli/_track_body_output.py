@@ -53,7 +53,7 @@ def report_nobody(why: str, folder: Path) -> int:
     """Print why there are no poses, and whether the folder has those of an earlier run; return 1."""
     earlier = folder / _POSES[0]
     said = f"; {earlier} is of an earlier run" if earlier.exists() else ""
-    print(f"torchpose: {why}, so there are no poses{said}", file=sys.stderr)
+    print(f"torchpose: there are no poses: {why}{said}", file=sys.stderr)
     return 1
 
 

@@ -29,9 +29,9 @@ class Observed(NamedTuple):
     keypoints: KeypointMeasurement | None = None
 
 
-def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
-    """Return whether the silhouette of every camera has more than 0.2 % of the frame's pixels."""
-    return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
+def which_see(silhouettes: Bool[Tensor, "C H W"]) -> Bool[Tensor, " C"]:
+    """Return of which cameras the silhouette has more than 0.2 % of the frame's pixels."""
+    return silhouettes.double().mean((-2, -1)) > _SEEN
 
 
 @takes_former_arguments

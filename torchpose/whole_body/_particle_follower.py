@@ -25,7 +25,7 @@ from torchpose.whole_body._filter_table import LEARNT, METHODS, make_filter, reb
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._first_pose import find_first_pose
-from torchpose.whole_body._following import Observed, all_see, follow
+from torchpose.whole_body._following import Observed, follow, which_see
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 from torchpose.whole_body._keypoints.keypoint_notes import TOO_FEW, late_note
 from torchpose.whole_body._measured_keypoints import (
@@ -150,6 +150,7 @@ class ParticleFollower:
             check_tensors(silhouettes=frame)
             if plain:
                 check_shape("a frame of silhouettes", frame, ["C", "H", "W"])
+                self.cameras.check_images("silhouettes", frame.shape)
             return frame
 
         return map(checked, silhouettes)
@@ -162,18 +163,23 @@ class ParticleFollower:
         Raises:
             NobodySeenError: there is none.
         """
-        if measured is not None:
-            begun = self.measurer.first_frame(measured)
-            found = next(((begun, one) for one in islice(frames, begun, None)), None)
-        else:
-            shown = ((t, one) for t, one in enumerate(frames) if all_see(_masks(one)))
-            found = next(shown, None)
-        if found is None:
-            raise NobodySeenError(
-                "nobody is seen by all cameras in any frame; check the silhouettes, or leave out the "
-                "camera that sees nobody"
-            )
-        return found
+        begun = 0 if measured is None else self.measurer.first_frame(measured)
+        ever = torch.zeros(len(self.cameras), dtype=torch.bool)
+        for t, one in islice(enumerate(frames), begun, None):
+            if measured is not None:
+                return t, one
+            seeing = which_see(_masks(one)).cpu()
+            if bool(seeing.all()):
+                return t, one
+            ever = ever | seeing
+        blind = [
+            name for name, saw in zip(self.cameras.names, ever.tolist(), strict=True) if not saw
+        ]
+        raise NobodySeenError(
+            "nobody is seen by all cameras in any frame"
+            + (f", and by {', '.join(blind)} in none" if blind else "")
+            + "; check the silhouettes, or leave out a camera that sees nobody"
+        )
 
     def first_state(
         self, frames: Sequence[Observed], generator: torch.Generator | None, facing: Tensor | None
