@@ -263,6 +263,14 @@ def test_a_track_in_place_of_joints_and_other_sizes_beside_them_are_named(scene,
             draw(joints, covariance=torch.eye(3))
 
 
+def test_many_methods_do_not_look_alike() -> None:
+    errors = {str(i): torch.rand(3, 8).double() for i in range(20)}
+    styles = style.method_styles(list(errors))
+    assert len({(s["color"], s["linestyle"]) for s in styles.values()}) == 20
+    bars = viz.plot_error_bars(errors).legends[0].get_patches()
+    assert len({(bar.get_facecolor(), bar.get_hatch()) for bar in bars}) == 20
+
+
 def test_arrays_are_drawn_as_tensors_are() -> None:
     drawn = as_drawn([None, 2], np.zeros((3, 2)), observed=np.ones(3, bool))
     assert torch.equal(drawn[0], torch.zeros(3, 2).double()) and bool(drawn[2].all())

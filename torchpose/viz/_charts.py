@@ -24,6 +24,7 @@ from torchpose.viz._style import (
     NORMAL,
     PALE,
     add_legend,
+    bar_style,
     check_named,
     join_unit,
     joint_colors,
@@ -265,11 +266,12 @@ def plot_error_bars(
         levels = torch.tensor([0.25, 0.75], dtype=torch.float64)
         low, high = to_numpy(torch.nanquantile(flat, levels, dim=0))
         place = torch.arange(8).numpy() - 0.4 + (i + 0.5) * width
-        ax.bar(place, mean, 0.9 * width, color=styles[name]["color"], alpha=0.85)
+        filled = bar_style(i, styles[name]["color"])
+        ax.bar(place, mean, 0.9 * width, **filled)
         ax.vlines(place, low, high, color=INK, linewidth=1.1)
         average = float(flat.nanmean())
         label = f"{name} (mean {average:.1f} {unit})"
-        entries.append(Patch(color=styles[name]["color"], alpha=0.85, label=label))
+        entries.append(Patch(**filled, label=label))
     entries.append(legend_line("middle half of the errors", linewidth=1.1))
     ax.set_xticks(range(8), [readable(n).replace(" ", "\n") for n in UPPER_BODY])
     ax.tick_params(axis="x", length=0, labelsize=NORMAL, labelcolor=INK)

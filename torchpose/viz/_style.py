@@ -21,7 +21,8 @@ LEFT, RIGHT, MIDDLE = "#0072B2", "#D55E00", "#555555"
 SIDE_COLORS = {"left": LEFT, "right": RIGHT, "middle": MIDDLE}
 _METHODS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)),
-                            (0, (3, 1, 1, 1, 1, 1)), "-")  # fmt: skip
+                            (0, (3, 1, 1, 1, 1, 1)))  # fmt: skip
+_HATCHES = ("", "///", "...", "xxx")
 SMALL, NORMAL, LARGE = 9.0, 10.0, 11.5
 _EDGE = 0.1  # inches to either side of a title
 _DPI = 150  # of pictures in pixels
@@ -129,12 +130,26 @@ def check_named(name: str, values: Any, example: str) -> None:
 
 
 def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return colour and dashes of each method, in the order given."""
+    """Return colour and dashes of each method, in their order; where colours come again, dashes differ."""
     if not names:
         raise InputError("expected at least one named curve, got none")
+    styles = {}
+    for i, name in enumerate(names):
+        again, color = divmod(i, len(_METHODS))
+        dashes = _DASHES[(i + again) % len(_DASHES)]
+        styles[name] = {"color": _METHODS[color], "linestyle": dashes}
+    return styles
+
+
+def bar_style(i: int, color: str) -> dict[str, Any]:
+    """Return how the bars of method i are filled; where colours come again, with another hatch."""
+    hatch = _HATCHES[i // len(_METHODS) % len(_HATCHES)]
     return {
-        name: {"color": _METHODS[i % len(_METHODS)], "linestyle": _DASHES[i % len(_DASHES)]}
-        for i, name in enumerate(names)
+        "facecolor": color,
+        "edgecolor": "white",
+        "linewidth": 0.0,
+        "hatch": hatch,
+        "alpha": 0.85,
     }
 
 
