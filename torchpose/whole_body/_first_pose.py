@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose.body._fitting import fit_state
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import other_side
@@ -89,6 +89,7 @@ def find_first_pose(
         InputError: no frame, nobody seen in the first one, or a bad setting. Others: as
             `find_candidates`.
     """
+    check_tensors(silhouettes=silhouettes)
     check_shape("silhouettes", silhouettes, ["T", "C", "H", "W"])
     if len(silhouettes) == 0 or n_frames < 1 or not 0 < fps < math.inf or n_tracking < _LEAST:
         raise InputError(

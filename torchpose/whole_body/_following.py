@@ -66,8 +66,12 @@ def track_body(
     Raises:
         InputError: no frame, or a filter without a body. CameraError, ShapeError: as the filter.
     """
-    if not isinstance(model.body, Body):
-        raise InputError(f"the filter must track a Body, got {type(model.body).__name__}")
+    body = getattr(model, "body", None)
+    if not isinstance(model, SilhouetteParticleFilter) or not isinstance(body, Body):
+        raise InputError(
+            f"model must be a filter that tracks a Body, got {type(model).__name__} of "
+            f"{type(body).__name__}"
+        )
     state = model.init(initial_state[None], generator=generator, initial_cov=initial_cov)
     bar = tqdm(frames, total=n_frames, disable=not progress, unit="frame")
     poses = follow(model, state, map(Observed, bar), cameras, generator)[1]

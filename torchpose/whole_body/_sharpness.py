@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
@@ -95,7 +96,8 @@ def fit_sharpness(
         `SharpnessFit`. An exponent whose error is not finite is never chosen.
 
     Raises:
-        InputError: no sequences, no values, or a sequence without truth.
+        InputError: no sequences, no values, a sequence without truth, or no value of a finite error.
+            ShapeError: joints of another number of frames.
 
     Reference: MR, equation (31), and section 6.1: parameters are set by an optimisation.
     """
@@ -112,6 +114,10 @@ def fit_sharpness(
         found = [_error(tracker, one, seeds) for one in sequences]
         errors.append(sum(found) / len(found))
     finite = [e if math.isfinite(e) else math.inf for e in errors]
+    if min(finite) == math.inf:
+        raise InputError(
+            f"no value has a finite error, got {errors}; check the true joints of the sequences"
+        )
     return SharpnessFit(tried[finite.index(min(finite))], tried, tuple(errors))
 
 
@@ -126,6 +132,7 @@ def _error(tracker: SilhouetteParticleFilter, one: ValidationSequence, seeds: in
         raise InputError(
             "a validation sequence needs its true states, or its joints and an initial state"
         )
+    check_shape("joints of a validation sequence", joints, [len(one.silhouettes), None, 3])
     # a stream of numbers for each run, the same ones for every value
     generators = [
         torch.Generator(tracker.step_std.device).manual_seed(seed) for seed in range(seeds)

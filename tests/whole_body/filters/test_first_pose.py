@@ -106,5 +106,7 @@ def test_what_is_refused():
         find_first_pose(BODY, image, RIG, n_tracking=19)
     with pytest.raises(ShapeError):
         find_first_pose(BODY, image[None], RIG)
+    with pytest.raises(InputError, match="silhouettes must be a tensor, got ndarray"):
+        find_first_pose(BODY, image.numpy(), RIG)
     with pytest.raises(InputError, match="are empty"):
         find_first_pose(BODY, torch.zeros_like(image), RIG)

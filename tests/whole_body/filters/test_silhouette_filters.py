@@ -24,6 +24,7 @@ from torchpose.whole_body import (
     default_step_std,
     fit_sharpness,
     motion_std,
+    track_body,
 )
 from torchpose.whole_body._filters.annealed import anneal
 from torchpose.whole_body._filters.body_particles import resample_state
@@ -533,6 +534,11 @@ def test_the_budget_is_a_grid_and_every_value_sees_the_same_numbers():
         fit_sharpness(make, [joints_only], n_values=1)
     with pytest.raises(InputError, match="at least one sequence"):
         fit_sharpness(make, [])
+    unknown = walk_sequence(1)._replace(joints=torch.full((40, 1, 3), math.nan))
+    with pytest.raises(ShapeError, match=r"of a validation sequence must have shape .40, any"):
+        fit_sharpness(make, [unknown._replace(joints=torch.zeros(1, 1, 3))], n_values=1)
+    with pytest.raises(InputError, match="no value has a finite error"):
+        fit_sharpness(make, [unknown], n_values=2, seeds=1)
     with pytest.raises(InputError, match="0 < low"):
         log_grid(0, 1, 3)
 
@@ -612,6 +618,12 @@ def test_options_that_the_annealed_filter_refuses(options, message):
 def test_inputs_that_are_refused():
     body, masks = LinearBody(3), torch.ones(4, 2, 5, 6, dtype=torch.bool)
     tracker = SIRParticleFilter(body, 5)
+    with pytest.raises(
+        InputError, match=r"model must be a filter that tracks a Body, got SIR.* of Lin"
+    ):
+        track_body(tracker, masks, None, torch.zeros(3))
+    with pytest.raises(InputError, match=r"tracks a Body, got str of NoneType"):
+        track_body("sir", masks, None, torch.zeros(3))
     with pytest.raises(InputError, match="precision of SIRParticleFilter"):
         tracker.half()
     with pytest.raises(InputError, match=r"body must be a torchpose.body.Body, .* got str"):
@@ -625,6 +637,20 @@ def test_inputs_that_are_refused():
             tracker(given, None, start)
     with pytest.raises(InputError, match="silhouettes must be a tensor, got list"):
         tracker.step(tracker.init(torch.zeros(1, 3)), [masks[0]], None)
+    with pytest.raises(InputError, match="initial_state must be a tensor, got list"):
+        tracker.init([0.0] * 3)
+    state = tracker.init(torch.zeros(1, 3))
+    for other, said in (
+        (state.particles, "state must be a BodyFilterState .* got Tensor"),
+        (
+            SIRParticleFilter(body, 4).init(torch.zeros(1, 3)),
+            r"particles must have shape \[B, 5, 3\]",
+        ),
+        (state._replace(trend=torch.zeros(1, 2, 3)), "state is of another kind of filter"),
+    ):
+        for run, frames in ((tracker.step, masks[:1]), (tracker.advance, masks[None])):
+            with pytest.raises((InputError, ShapeError), match=said):
+                run(other, frames, None)
     with pytest.raises(ShapeError, match="initial_state"):
         tracker(masks, None, torch.zeros(4))
     with pytest.raises(ShapeError, match="initial_state must be"):

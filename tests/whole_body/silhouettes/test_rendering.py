@@ -334,6 +334,10 @@ def test_bad_input():
         count_pixels(limbs, torch.zeros(3, 12), rig, silhouettes)
     with pytest.raises(ShapeError, match="leading dimensions"):
         count_pixels(limbs, None, rig, silhouettes.expand(2, 3, HEIGHT, WIDTH))
+    with pytest.raises(InputError, match="silhouettes must be a tensor, got ndarray"):
+        count_pixels(limbs, None, rig, silhouettes.numpy())
+    with pytest.raises(InputError, match="silhouettes must be finite, got nan"):
+        count_pixels(limbs, None, rig, silhouettes * torch.nan)
     with pytest.raises(ShapeError, match=r"\[\.\.\., C, H, W\]"):
         count_pixels(limbs, None, rig, silhouettes[0])
     with pytest.raises(ShapeError, match="both ends"):

@@ -19,6 +19,7 @@ from torchpose._core.checks import (
     check_finite,
     check_positive,
     check_shape,
+    check_tensors,
     number_of,
 )
 from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
@@ -212,6 +213,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         Raises:
             ShapeError: other sizes. InputError: NaN or infinite numbers, a list of another length.
         """
+        check_tensors(initial_state=initial_state)
         start = initial_state.to(self.step_std, copy=True).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
         check_finite("initial_state", start)
@@ -248,8 +250,9 @@ class SilhouetteParticleFilter(BodyFilterHooks):
             The next state, and a `BodyFilterOutput` without the dimension of time.
 
         Raises:
-            ShapeError, InputError, CameraError: as `forward`.
+            ShapeError, InputError, CameraError: as `forward`, or the state of another filter.
         """
+        self._check_state(state)
         check_observation(silhouettes, len(state.mean), generator, plain=self._plain)
         state, out = self.filter_frame(state, silhouettes, cameras, generator)
         self.warn(stack_outputs([out]))
@@ -277,6 +280,8 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
+        self._check_state(state)
+        check_tensors(silhouettes=silhouettes)
         if self._plain and silhouettes.ndim == 4:
             warn_of_former("advance is of several frames now, filter_frame of one; one frame goes")
             check_observation(silhouettes, len(state.mean), generator, plain=True)
@@ -388,6 +393,16 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         return zero.masked_fill(~self.limits.inside(particles).all(-1), -torch.inf)
 
     # --- helpers
+
+    def _check_state(self, state: object) -> None:
+        """Raise unless this is a state of this filter, of as many particles over as many columns."""
+        if not isinstance(state, BodyFilterState):
+            raise InputError(
+                f"state must be a BodyFilterState from this filter's init or step, got {type(state).__name__}"
+            )
+        check_shape("state.particles", state.particles, ["B", self.n_particles, self.body.dim])
+        if (state.trend is None) != (self.first_trend(state.mean) is None):
+            raise InputError("state is of another kind of filter; begin with init")
 
     def _outlined(self, silhouettes: Tensor | None, cameras: Any) -> Frame | None:
         """Return the frame of silhouettes, if there are any."""

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose._core.checks import check_finite, check_tensors
 from torchpose.body._limbs import Limbs
 from torchpose.camera._rig import Cameras, as_rig
 from torchpose.errors import InputError, ShapeError
@@ -89,16 +90,20 @@ def prepare_silhouettes(silhouettes: Tensor | PreparedSilhouettes) -> PreparedSi
         silhouettes: [*B, C, H, W], True (or not zero) on the person; what is prepared stays as it is.
 
     Raises:
-        ShapeError: fewer than three dimensions, or an image without pixels.
+        ShapeError: fewer than three dimensions, or an image without pixels. InputError: no tensor, or NaN.
     """
     if isinstance(silhouettes, PreparedSilhouettes):
         return silhouettes
+    check_tensors(silhouettes=silhouettes)
     if silhouettes.ndim < 3 or 0 in silhouettes.shape[-3:]:
         raise ShapeError(
             f"silhouettes must have shape [..., C, H, W], got {list(silhouettes.shape)}"
         )
     cameras, height, width = silhouettes.shape[-3:]
-    mask = silhouettes if silhouettes.dtype == torch.bool else silhouettes != 0
+    mask = silhouettes
+    if silhouettes.dtype != torch.bool:
+        check_finite("silhouettes", silhouettes)
+        mask = silhouettes != 0
     before = pad(mask.flatten(-3).cumsum(-1, dtype=torch.int32), (1, 0))
     ends = before[..., :: height * width]
     return PreparedSilhouettes(before, ends.diff(dim=-1).long(), (cameras, height, width))
