@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
-from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
+from torchpose.errors import (
+    CovarianceError,
+    FileFormatError,
+    InputError,
+    PriorError,
+    ShapeError,
+    SkeletonError,
+)
 from torchpose.learning import fit_limb_conditionals
 from torchpose.math import compose, gaussian_rotate, rotate_gaussian
 from torchpose.math._rotation_gaussians import turn_gaussian
@@ -268,6 +275,16 @@ def test_bad_input(body, sequences, conditionals):
         fit(body, [states[:1] for states in sequences], 60.0)
     with pytest.raises(InputError, match="two frames in a row"):
         fit(body, [], 60.0)
+    buffers = {name: value.clone() for name, value in conditionals.named_buffers()}
+    for name, value, said in (
+        ("covariance", -buffers["covariance"], "covariance must be positive definite"),
+        ("diffusion", -buffers["diffusion"], "diffusion must be positive definite"),
+        ("covariance", buffers["covariance"] + torch.ones(3, 3).triu(1), "must be symmetric"),
+    ):
+        with pytest.raises(CovarianceError, match=said):
+            LimbConditionals(conditionals.info, **{**buffers, name: value})
+    flat = {**buffers, "diffusion": buffers["diffusion"] * torch.tensor([1.0, 1.0, 0.0]).diag()}
+    LimbConditionals(conditionals.info, **flat)
     with pytest.raises(InputError, match="limbs that move"):
         fit(body, [states[:1].expand(9, -1) for states in sequences], 60.0)
     with pytest.raises(InputError, match="least_std must be zero or more"):

@@ -10,7 +10,7 @@ from tests.data import data_dir_or_skip
 from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
 from torchpose.cli._fit_bodies import command
-from torchpose.errors import PriorError
+from torchpose.errors import InputError, PriorError
 from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models
 from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, load_body_motion
@@ -102,6 +102,8 @@ def test_they_are_of_the_body_that_is_tracked():
     manifold = load_manifold("walk")
     manifold.check_for(body, 60.0)
     manifold.at_rate(25.0).check_for(body, 25.0)
+    with pytest.raises(InputError, match="fps must be positive"):
+        manifold.at_rate(0.0)
     for name in known_models("conditionals"):
         limbs = load_limb_conditionals(name)
         limbs.check_for(body.altered(frame="body", centres=limbs.centres))

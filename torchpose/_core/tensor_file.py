@@ -256,13 +256,14 @@ def _check_values(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
                 f"{name} must be positive, got {float(tensor.min()):g}; fit it again"
             )
         if name in kind.covariances:
-            check_covariance(name, _inflated(tensor.double()))
+            check_flat_covariance(name, tensor)
 
 
-def _inflated(cov: Tensor) -> Tensor:
-    """Return the covariance made a little larger, so that it passes where it has no extent in a direction."""
+def check_flat_covariance(name: str, covariance: Tensor) -> None:
+    """Raise as `check_covariance`, but for covariances without extent in a direction."""
+    cov = covariance.double()
     size = cov.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
-    return cov + 1e-7 * size * torch.eye(cov.shape[-1], dtype=cov.dtype)
+    check_covariance(name, cov + 1e-7 * size * torch.eye(cov.shape[-1]).to(cov))
 
 
 def _fits(value: Any, hint: Any) -> bool:

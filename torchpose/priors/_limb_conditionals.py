@@ -24,7 +24,12 @@ from torchpose._core.checks import (
 from torchpose._core.module_state import NoHalfModule, derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
-from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
+from torchpose._core.tensor_file import (
+    FileKind,
+    check_flat_covariance,
+    read_tensors,
+    write_tensors,
+)
 from torchpose.body._kinematics import Body, centres_of
 from torchpose.errors import FileFormatError, InputError, PriorError
 from torchpose.math._rotation_gaussians import (
@@ -133,6 +138,7 @@ class LimbConditionals(NoHalfModule):
     Raises:
         SkeletonError: edges with a cycle, an unknown part or a part with two above it. PriorError: an
             edge of the root. ShapeError: sizes that do not go together. InputError: unknown directions.
+            CovarianceError: what is no covariance.
 
     Reference: Daubney & Xie, sections 4 and 7.
     """
@@ -184,6 +190,8 @@ class LimbConditionals(NoHalfModule):
         ):
             check_shape(name, value, sizes)
             check_finite(name, value)
+            if name in _KIND.covariances:
+                check_flat_covariance(name, value)
             register_given(self, name, value)
 
     fit = staticmethod(

@@ -298,6 +298,8 @@ def test_what_does_not_fit_is_refused_with_a_way_out():
     body, conditionals, _, _ = scene()
     with pytest.raises(PriorError, match="in_body_frame"):
         RootUncertaintyTracker(walker(), conditionals, fps=60.0)
+    with pytest.raises(InputError, match="conditionals must be LimbConditionals, got str"):
+        RootUncertaintyTracker(body, "walk", fps=60.0)
     elsewhere = body.altered(centres=torch.zeros_like(body.centres))
     with pytest.raises(PriorError, match=r"Body\.altered"):
         RootUncertaintyTracker(elsewhere, conditionals, fps=60.0)

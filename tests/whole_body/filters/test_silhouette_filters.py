@@ -483,6 +483,8 @@ def test_what_the_manifold_filter_refuses():
         ManifoldParticleFilter(body, six_root_manifold(), weights="exact")
     with pytest.raises(InputError, match="proposal must be one of"):
         ManifoldParticleFilter(body, six_root_manifold(), proposal="exact")
+    with pytest.raises(InputError, match=r"manifold must be a Back.* got str"):
+        ManifoldParticleFilter(body, "walk")
     with pytest.raises(PriorError, match="fit_gplvm_noise"):
         ManifoldParticleFilter(body, six_root_manifold(std_pose=tensor([math.nan] * 3)))
     with pytest.raises(ShapeError, match="std_pose"):
@@ -637,6 +639,13 @@ def test_inputs_that_are_refused():
             tracker(given, None, start)
     with pytest.raises(InputError, match="silhouettes must be a tensor, got list"):
         tracker.step(tracker.init(torch.zeros(1, 3)), [masks[0]], None)
+    for value, said in (
+        (torch.zeros(1, 1), r"what likelihood returns must have shape \[1, 5\], got \[1, 1\]"),
+        ([0.0] * 5, "what likelihood returns must be a tensor, got list"),
+    ):
+        own = SIRParticleFilter(body, 5, likelihood=lambda states, frame, value=value: value)
+        with pytest.raises((InputError, ShapeError), match=said):
+            own(torch.zeros(2, 1), None, torch.zeros(3))
     with pytest.raises(InputError, match="initial_state must be a tensor, got list"):
         tracker.init([0.0] * 3)
     state = tracker.init(torch.zeros(1, 3))

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape, check_tensors
+from torchpose._core.checks import check_finite, check_rate, check_shape, check_tensors
 from torchpose._core.module_state import NoHalfModule
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
@@ -201,8 +201,10 @@ class BackConstrainedGPLVM(NoHalfModule):
             A copy; this manifold does not change.
 
         Raises:
-            PriorError: no standard deviations, or a file that does not say how they grow.
+            InputError: a rate that is not positive. PriorError: no standard deviations, or a file that does
+                not say how they grow.
         """
+        check_rate("fps", fps)
         known = bool(torch.isfinite(self.std_pose).all())
         latent, step = self.info.noise_factors(fps, known)
         other = copy.deepcopy(self)

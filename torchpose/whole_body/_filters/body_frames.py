@@ -121,7 +121,10 @@ def _sharpened(raw: Score, sharpness: float, seen: Bool[Tensor, " B"]) -> Score:
     def score(states: Tensor) -> Tensor:
         if nobody:
             return states.new_zeros(states.shape[:2], dtype=torch.float64)
-        value = sharpness * raw(states).double()
+        value = raw(states)
+        check_tensors(**{"what likelihood returns": value})
+        check_shape("what likelihood returns", value, list(states.shape[:2]))
+        value = sharpness * value.double()
         value = torch.where(torch.isfinite(value), value, -torch.inf)
         return torch.where(seen[:, None], value, 0.0)
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_shape
-from torchpose.errors import PriorError
+from torchpose.errors import InputError, PriorError
 from torchpose.filters._recursive_filter import Generators, standard_normal
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (
@@ -107,6 +107,11 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     ) -> None:
         check_choice("weights", weights, MANIFOLD_WEIGHTS)
         check_choice("proposal", proposal, MANIFOLD_PROPOSALS)
+        if not isinstance(manifold, PoseManifold):
+            raise InputError(
+                "manifold must be a BackConstrainedGPLVM, or have to_latent, pose_mean and check_for, got "
+                f"{type(manifold).__name__}"
+            )
         manifold.check_for(body, fps)
         columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
         _check_noise(manifold, len(columns))

@@ -144,6 +144,11 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         **options: Unpack[BodyFilterOptions],
     ) -> None:
         _check(body, options.get("likelihood"), weighting, least_std, first_std)
+        if not isinstance(conditionals, LimbConditionals):
+            raise InputError(
+                f"conditionals must be LimbConditionals, got {type(conditionals).__name__}; "
+                "load_limb_conditionals reads them from a file"
+            )
         check_rules(normalisation, camera_rule)
         check_positive("observation_sharpness", observation_sharpness)
         conditionals.check_for(body)
