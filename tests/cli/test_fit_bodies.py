@@ -197,6 +197,33 @@ def test_a_fit_that_was_killed_goes_on_to_the_same_result(torchpose, walks, tmp_
     assert kept.read_bytes() == b"something else"
 
 
+def test_a_manifold_of_one_dimension_has_no_picture(torchpose, walks, tmp_path):
+    out = tmp_path / "line.safetensors"
+    done = torchpose("fit", "manifold", walks, "--out", out, "--frames", 40, "--steps", 1,
+                     "--persons", "p0", "--latent-dim", 1)  # fmt: skip
+    assert done.code == 0, done.err
+    assert "note: there is no picture of one latent dimension" in done.out
+    assert sorted(path.name for path in tmp_path.glob("line*")) == ["line.md", "line.safetensors"]
+
+
+def test_fewer_dimensions_than_asked_for_are_a_note(torchpose, exercises, tmp_path):
+    done = torchpose("fit", "actions", exercises, "--actions", "action0", "--out",
+                     tmp_path / "one.safetensors", "--n-dimensions", 99, "--pictures", "false")  # fmt: skip
+    assert done.code == 0 and "Warning" not in done.err, done.err
+    assert "note: the postures of action0 span 31 dimensions, fewer than the 99" in done.out
+
+
+def test_people_who_stand_still_have_no_action(torchpose, tmp_path):
+    body = Body.of_height(BODY_15, 1.7)
+    for number in range(3):
+        states = torch.zeros(60, body.dim, dtype=torch.float64)
+        states[:, 1], states[:, 3 + 3 * BODY_15.part("torso")] = 0.9, 0.1 * number
+        write(tmp_path, "p0", number, body, states, 50.0, "still")
+    done = torchpose("fit", "actions", tmp_path, "--actions", "still", "--out",
+                     tmp_path / "still.safetensors", "--fps", 30)  # fmt: skip
+    assert done.code == 2 and "there is no motion to learn" in done.err
+
+
 def test_one_action_is_a_space(torchpose, exercises, tmp_path):
     out = tmp_path / "one.safetensors"
     done = torchpose("fit", "actions", exercises, "--actions", "action0", "--out", out,

@@ -1,6 +1,7 @@
 """`torchpose fit manifold|limbs|actions|body`: what body trackers learn from recordings of whole bodies."""
 
 import shlex
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -247,7 +248,10 @@ def fit_actions(
         settings, pictures = actions.ActionRecipe(**recipe), pictures_possible(pictures)
         performances = actions.Performances.gather(recordings, **choice, postures=postures)  # type: ignore[arg-type]
         _print_notes(performances.notes)
-        fitted = actions.fit_actions(performances, settings)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", UserWarning)
+            fitted = actions.fit_actions(performances, settings)
+        _print_notes(str(one.message) for one in said)
         print(write_action_files(fitted, results, file.name, pictures, **facts))
     return 0
 

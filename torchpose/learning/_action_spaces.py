@@ -18,6 +18,7 @@ from torchpose.priors._actions.space import ActionSpace
 
 _STD_FLOOR = 0.1  # of a dimension's deviation over the whole performance
 _LEAST_STD = 0.1  # degrees
+_STILL = 1e-3  # degrees, of somebody who does not move: rounding, and that of frames between frames
 _SMALLEST_VARIANCE = 1e-10  # of the largest; below it a direction is rounding
 
 
@@ -121,7 +122,7 @@ def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
     check_shape("performance 0", parts[0], ["T", POSTURE_DIM])
     if all(torch.equal(parts[0], part) for part in parts[1:]):
         raise InputError("all performances are one and the same: there is no deviation to learn")
-    if all(bool((part == part[0]).all()) for part in parts):
+    if all(float((part - part[0]).abs().max()) < _STILL for part in parts):
         raise InputError(
             "all postures of each performance are one and the same: there is no motion to learn"
         )

@@ -134,8 +134,12 @@ def write_manifold_files(
 
         return plot_manifold(manifold, {"held out": list(fitting.data.watched)[:1]})
 
-    pictures = {f"{Path(file).stem}.png": draw} if picture else None
-    return write_body_model(manifold, fitting.summary(manifold), results, file, pictures)
+    drawable = manifold.latent_dim > 1
+    pictures = {f"{Path(file).stem}.png": draw} if picture and drawable else None
+    written = write_body_model(manifold, fitting.summary(manifold), results, file, pictures)
+    if picture and not drawable:
+        written = f"{written}\nnote: there is no picture of one latent dimension"
+    return written
 
 
 def write_action_files(
