@@ -8,6 +8,7 @@ import torch
 from tests.draws import generator
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import JointLimits
+from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, PriorError
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.whole_body import (
@@ -120,6 +121,24 @@ def test_cameras_that_do_not_match(sequence, process_cov):
         tracker(silhouettes[..., ::2], RIG, start)
     with pytest.raises(CameraError):
         tracker.step(tracker.init(start[None]), silhouettes[:1, :2], RIG)
+    with pytest.raises(CameraError, match="60 x 80"):  # whatever they show
+        tracker(torch.zeros(3, 3, 60, 40, dtype=torch.bool), RIG, start)
+
+
+def test_cameras_may_come_one_after_the_other(sequence, process_cov):
+    start, _, silhouettes = sequence
+    tracker = SIRParticleFilter(BODY, 5, process_cov=process_cov)
+    cameras = [
+        PinholeCamera(
+            90, 90, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT, name, translation=(0, 0, 3)
+        )
+        for name in RIG.names
+    ]  # fmt: skip
+    one, two = (
+        tracker(silhouettes[:3], given, start, generator=generator()).mean
+        for given in (cameras, iter(cameras))
+    )
+    assert torch.equal(one, two)
 
 
 def test_a_manifold_of_another_body_is_refused(manifold):

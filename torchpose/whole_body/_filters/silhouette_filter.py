@@ -25,6 +25,7 @@ from torchpose._core.checks import (
 from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
 from torchpose._core.module_state import as_one_run
 from torchpose._core.moved import warn_of_former
+from torchpose.camera._rig import as_rig
 from torchpose.errors import InputError
 from torchpose.filters._measurements import check_lengths
 from torchpose.filters._outputs import effective_sample_size
@@ -254,6 +255,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         """
         self._check_state(state)
         check_observation(silhouettes, len(state.mean), generator, plain=self._plain)
+        cameras = self._checked_cameras(cameras, silhouettes)
         state, out = self.filter_frame(state, silhouettes, cameras, generator)
         self.warn(stack_outputs([out]))
         return state, out
@@ -299,7 +301,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         progress: bool = False,
     ) -> tuple[BodyFilterState, BodyFilterOutput]:
         """Return the state after some frames [B, T, ...], and their estimates: the one loop over time."""
-        steps = []
+        cameras, steps = self._checked_cameras(cameras, frames), []
         for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
             shown = frames[:, t] if lengths is None else seen_until(lengths > t, frames[:, t])
             state, out = self.filter_frame(state, shown, cameras, generator)
@@ -393,6 +395,18 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         return zero.masked_fill(~self.limits.inside(particles).all(-1), -torch.inf)
 
     # --- helpers
+
+    def _checked_cameras(self, cameras: Any, silhouettes: Tensor) -> Any:
+        """Return the cameras of silhouettes as a rig; what a callable takes stays as it is.
+
+        Raises:
+            CameraError: no cameras, or silhouettes of another number or size.
+        """
+        if not self._plain:
+            return cameras
+        rig = as_rig(cameras)
+        rig.check_images("silhouettes", silhouettes.shape)
+        return rig
 
     def _check_state(self, state: object) -> None:
         """Raise unless this is a state of this filter, of as many particles over as many columns."""
