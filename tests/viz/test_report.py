@@ -16,7 +16,7 @@ import torch
 from tests.upper_body.test_bvh import track_of as of_joints
 from torchpose.body import BODY_15, Body
 from torchpose.body._feet import FEET
-from torchpose.camera import PinholeCamera
+from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.demo import performer
 from torchpose.errors import InputError, OutputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
@@ -109,7 +109,10 @@ def test_a_body_has_its_own_bones(tmp_path):
         body, state, state, body.joints(state), torch.zeros(2, 15, 3, 3).double(), nothing,
         nothing, nothing > 0, nothing > 0,
     )  # fmt: skip
-    seen = track.seen_by(PinholeCamera(80, 80, 39.5, 29.5, 80, 60))
+    camera = PinholeCamera(80, 80, 39.5, 29.5, 80, 60)
+    with pytest.raises(InputError, match="camera must be one PinholeCamera, got CameraRig"):
+        track.seen_by(CameraRig([camera]))
+    seen = track.seen_by(camera)
     limbs = read(write_report(tmp_path / "a.html", [seen])).data["limbs"]
     pairs = {(BODY_15.names[a], BODY_15.names[b]) for a, b in limbs}
     assert len(limbs) == 14 and {("pelvis", "left_hip"), ("left_elbow", "left_wrist")} <= pairs

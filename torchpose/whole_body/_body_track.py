@@ -272,7 +272,12 @@ class BodyTrack:
             which of them were observed [1, T, J]: all where a camera saw the person; of keypoints
             (``details["inlier"]``) those of which a camera's was the joint's with more than 1/2. Those of
             `feet` follow.
+
+        Raises:
+            InputError: not one camera.
         """
+        if not isinstance(camera, PinholeCamera):
+            raise InputError(f"camera must be one PinholeCamera, got {type(camera).__name__}")
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
         names, points, covariance = points_of(self)
         return CameraPoses(

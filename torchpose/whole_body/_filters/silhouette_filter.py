@@ -89,7 +89,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
             the angle between its upper legs over pi (Daubney & Xie, section 8); 0 for never.
         limb_shape: of the body in silhouettes, "cylinders" or "rectangles" (AS, section 3.2).
         respread_scale: particles that all died are drawn about the last mean with this many times
-            the noise of a step, twice that in the second such frame, and so on.
+            the noise of a step, twice that in the second such frame, and so on up to ten times.
 
     Raises:
         InputError, ShapeError: an argument is not as described.
