@@ -175,6 +175,9 @@ def test_gaps_and_other_bad_input_are_named():
         fit_state(body, joints, steps=-1)
     with pytest.raises(ShapeError, match="joints must have shape"):
         fit_state(body, joints[:, :14])
+    for fit in (lambda: fit_state(body, joints.numpy()), lambda: fit_body(joints.numpy())):
+        with pytest.raises(InputError, match="joints must be a tensor, got ndarray"):
+            fit()
 
 
 @pytest.mark.data

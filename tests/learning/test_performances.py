@@ -109,6 +109,17 @@ def test_bad_input():
     ):
         with pytest.raises(InputError, match=message):
             synchronise(bad)
+    for axis, message in (
+        (torch.zeros(36), "axis must be a direction, got zero"),
+        (torch.zeros(5), r"axis must have shape \[36\], got \[5\]"),
+        (good[0][0].numpy(), "axis must be a tensor, got ndarray"),
+    ):
+        with pytest.raises((InputError, ShapeError), match=message):
+            split_repetitions(good[0], 30.0, axis)
+    with pytest.raises(InputError, match="recording 0 must be a tensor, got ndarray"):
+        repetition_axis([good[0].numpy()])
+    with pytest.raises(ShapeError, match="recording 0 must have shape"):
+        repetition_axis(good[0])
     with pytest.raises(ShapeError, match="performance 1"):
         synchronise([good[0], good[1][:, :5]])
     with pytest.raises(InputError, match="n_postures must be at least 8, got 3"):

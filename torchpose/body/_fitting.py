@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_shape, check_tensors
 from torchpose._core.facade import set_up_facade
 from torchpose._core.rows import where_rows
 from torchpose.body._kinematics import Body, Frame
@@ -71,6 +71,7 @@ def fit_body(
         InputError: a joint is missing in some frames only, a bone has no length, no joint of the
             pelvis or torso. ShapeError: another number of joints.
     """
+    check_tensors(joints=joints)
     joints = joints.double()
     roles, known = _roles(skeleton), _known_joints(skeleton, joints)
     bones = _bones(skeleton, joints)
@@ -136,6 +137,7 @@ def fit_state(body: Body, joints: Float[Tensor, "T J 3"], steps: int = 4) -> Flo
     """
     if steps < 0:
         raise InputError(f"steps must not be negative, got {steps}")
+    check_tensors(joints=joints)
     joints = joints.to(body.offsets)
     known = _known_joints(body.skeleton, joints)
     tilt, chunks = _tilt_of(body, joints), joints.split(_CHUNK)

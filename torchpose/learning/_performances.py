@@ -236,13 +236,19 @@ def split_repetitions(
         is away once only.
 
     Raises:
-        InputError: no frames, not finite, or a frame rate that is not positive.
+        InputError: no frames, not finite, an axis of length zero, or a frame rate that is not positive.
+            ShapeError: an axis of other columns.
 
     >>> angle = torch.arange(300) * (2 * math.pi / 100)
     >>> split_repetitions(1 - angle.cos()[:, None], 30.0)
     [slice(4, 101, None), slice(100, 201, None), slice(200, 300, None)]
     """
+    check_tensors(postures=postures, axis=axis)
     check_shape("postures", postures, ["T", None])
+    if axis is not None:
+        check_shape("axis", axis, [postures.shape[1]])
+        if not 0 < float(axis.norm()) < math.inf:
+            raise InputError("axis must be a direction, got zero or what is not finite")
     if not 0 < fps < math.inf or len(postures) == 0:
         raise InputError(
             f"expected frames at a positive rate, got {len(postures)} frames at {fps:g} per second"
@@ -275,6 +281,9 @@ def repetition_axis(recordings: Sequence[Float[Tensor, "_ Q"]]) -> Float[Tensor,
     Raises:
         InputError: no recording, one without frames, or not finite. ShapeError: other columns.
     """
+    recordings = list(recordings)
+    for number, recording in enumerate(recordings):
+        check_tensors(**{f"recording {number}": recording})
     if not recordings or not all(map(len, recordings)):
         raise InputError("an axis needs recordings with at least one frame each, got one of none")
     for number, recording in enumerate(recordings):
