@@ -79,6 +79,20 @@ def test_a_cycle_of_few_frames_shows_each_pose_once(body) -> None:
     assert len(places) == shown
 
 
+def test_sequences_that_are_empty_or_stand_still_are_drawn(body) -> None:
+    poses = motion(40)
+    for first in (poses[:0], poses[:1].expand(6, -1)):
+        figure = plot_manifold(fit_gplvm([first, poses], steps=1), body=body, resolution=5)
+        assert len(figure.axes[1].texts) > 1
+
+
+def test_other_poses_of_a_name_that_was_fitted_are_dashed(manifold) -> None:
+    legend = plot_manifold(manifold, {"a": motion(9)}, resolution=5).legends[0]
+    dashed = [line.is_dashed() for line in legend.get_lines()]
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b", "a"]
+    assert dashed == [False, False, True]
+
+
 def test_names_that_share_a_colour_have_other_marks() -> None:
     info = ManifoldInfo(name="many", sequences=tuple("abcdefghi"))
     many = fit_gplvm([motion(5, seed=i) for i in range(9)], steps=1, info=info)
@@ -91,6 +105,8 @@ def test_what_cannot_be_drawn_is_refused(manifold, body) -> None:
     one = fit_gplvm(motion(30), latent_dim=1, steps=1)
     with pytest.raises(InputError, match="needs two dimensions or more, got 1"):
         plot_manifold(one)
+    with pytest.raises(InputError, match=r"n_poses must be a whole number, got 2\.5"):
+        plot_manifold(manifold, n_poses=2.5)
     with pytest.raises(InputError, match="resolution and n_poses must be at least 2"):
         plot_manifold(manifold, resolution=1)
     with pytest.raises(PriorError, match="frame"):

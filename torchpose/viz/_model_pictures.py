@@ -84,6 +84,8 @@ def plot_manifold(
     check_named("others", others, '{"held out": poses}')
     if manifold.latent_dim < 2:
         raise InputError("a picture of the latent space needs two dimensions or more, got 1")
+    for count in (resolution, n_poses):
+        check_count("resolution and n_poses", count)
     if resolution < 2 or n_poses < 2:
         raise InputError(
             f"resolution and n_poses must be at least 2, got {resolution} and {n_poses}"
@@ -107,12 +109,13 @@ def plot_manifold(
         _number(ax, places)
     style_axes(ax, "first latent dimension", "second latent dimension", grid=False)
     _draw_deviation(ax, manifold, everything, resolution)
-    styles = _path_styles(fitted, watched)
-    for name, paths in [*fitted.items(), *watched.items()]:
+    named, styles = [*fitted.items(), *watched.items()], _path_styles(len(fitted), len(watched))
+    for (_, paths), style in zip(named, styles, strict=True):
         for path in paths:
-            _draw_path(ax, path, styles[name])
+            _draw_path(ax, path, style)
     ax.set_aspect("equal")
-    add_legend(figure, [legend_line(name, **style) for name, style in styles.items()])
+    labels = zip(named, styles, strict=True)
+    add_legend(figure, [legend_line(name, **style) for (name, _), style in labels])
     return figure
 
 
@@ -165,21 +168,18 @@ def _draw_deviation(
     bar.outline.set_edgecolor(PALE)
 
 
-def _path_styles(
-    fitted: Mapping[str, Any], watched: Mapping[str, Any]
-) -> dict[str, dict[str, Any]]:
+def _path_styles(n_fitted: int, n_watched: int) -> list[dict[str, Any]]:
     """Return how the sequences of each name are drawn: where colours come again, marks are others."""
-    marked: dict[str, list[str]] = {}
-    styles = {}
-    for name, style in method_styles([*fitted, *watched]).items():
-        alike = marked.setdefault(style["color"], [])
-        alike.append(name)
-        styles[name] = {
-            "color": style["color"], "linestyle": "-" if name in fitted else (0, (4, 1.5)),
-            "linewidth": 1.3, "marker": _MARKS[(len(alike) - 1) % len(_MARKS)], "markersize": 7,
-            "markeredgewidth": 1.6, "markerfacecolor": style["color"] if name in fitted else "white",
-        }  # fmt: skip
-    return styles
+    looks = method_styles([str(i) for i in range(n_fitted + n_watched)]).values()
+    colors = [look["color"] for look in looks]
+    return [
+        {
+            "color": color, "linestyle": "-" if i < n_fitted else (0, (4, 1.5)), "linewidth": 1.3,
+            "marker": _MARKS[colors[:i].count(color) % len(_MARKS)], "markersize": 7,
+            "markeredgewidth": 1.6, "markerfacecolor": color if i < n_fitted else "white",
+        }
+        for i, color in enumerate(colors)
+    ]  # fmt: skip
 
 
 def _draw_path(ax: Axes, path: Tensor, style: Mapping[str, Any]) -> None:
@@ -197,7 +197,7 @@ def _draw_path(ax: Axes, path: Tensor, style: Mapping[str, Any]) -> None:
 
 def _draw_poses(part: Any, manifold: BackConstrainedGPLVM, body: Body, n_poses: int) -> Tensor:
     """Draw poses along the first sequence, beside each other; return their latent points."""
-    path = manifold.trajectories()[0]
+    path = next(path for path in manifold.trajectories() if len(path))
     cycle = path[: _cycle(path)]
     n_poses = min(n_poses, len(cycle))
     at = torch.arange(n_poses) * len(cycle) // n_poses
@@ -233,7 +233,7 @@ def _cycle(path: Tensor) -> int:
     """Return the frames until a trajectory is back where it started; all of them if it never is."""
     distance = (path - path[0]).norm(dim=-1)
     away = int((distance > 0.6 * distance.max()).long().argmax())
-    for frame in range(away, len(path) - 1):
+    for frame in range(max(away, 1), len(path) - 1):
         nearest = distance[frame] <= distance[frame - 1 : frame + 2].min()
         if nearest and distance[frame] < 0.35 * distance.max():
             return frame
