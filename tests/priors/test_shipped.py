@@ -119,3 +119,5 @@ def test_names_and_files(tmp_path):
         load_manifold("run")
     with pytest.raises(PriorError, match="an action space or bank"):
         load_action("walk")
+    with pytest.raises(PriorError, match="a manifold is loaded by its name or file, got Back"):
+        load_manifold(load_manifold("walk"))

@@ -44,6 +44,10 @@ def find_model(kind: str, name_or_path: str | Path) -> Path:
     Raises:
         PriorError: neither a known name nor a file.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise PriorError(
+            f"{KINDS[kind]} is loaded by its name or file, got {type(name_or_path).__name__}"
+        )
     if str(name_or_path) in known_models(kind):
         return WEIGHTS / kind / f"{name_or_path}.safetensors"
     if Path(name_or_path).is_file():
