@@ -38,5 +38,15 @@ def test_bad_input():
         plot_rotations(gaussian)
     with pytest.raises(InputError, match="direction must have a length"):
         plot_rotations({"a": gaussian}, direction=(0.0, 0.0, 0.0))
+    for bad, said in (
+        (gaussian[:2], r"gaussians\['a'\] must be a mean, a covariance and a centre or None"),
+        ((torch.zeros(3), -torch.eye(3), None), "covariance must be positive definite"),
+        ((torch.zeros(3) * torch.nan, torch.eye(3), None), "mean must be finite"),
+        ((np.zeros(3), torch.eye(3), None), "mean must be a tensor, got ndarray"),
+    ):
+        with pytest.raises(InputError, match=said):
+            plot_rotations({"a": bad})
+    with pytest.raises(InputError, match="draws must be a whole number of 0 or more, got -5"):
+        plot_rotations({"a": gaussian}, draws=-5)
     with pytest.raises(ShapeError, match="covariance must have shape"):
         plot_rotations({"a": (torch.zeros(3), torch.eye(2), None)})

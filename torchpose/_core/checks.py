@@ -283,6 +283,13 @@ def check_covariance(name: str, covariance: Tensor) -> None:
         )
 
 
+def check_flat_covariance(name: str, covariance: Tensor) -> None:
+    """Raise as `check_covariance`, but for covariances without extent in a direction."""
+    cov = covariance.double()
+    size = cov.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
+    check_covariance(name, cov + 1e-7 * size * torch.eye(cov.shape[-1]).to(cov))
+
+
 def _at(index: tuple[int, ...]) -> str:
     """Return where a matrix is among several, for a message; nothing for a single one."""
     return f" at index {index}" if index else ""

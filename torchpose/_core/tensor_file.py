@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from torchpose._core.checks import check_covariance, check_finite, check_rate
+from torchpose._core.checks import check_finite, check_flat_covariance, check_rate
 from torchpose._core.files import atomic_path
 from torchpose._core.reading import reading, require_file, sizes_fit
 from torchpose.errors import FileFormatError, OutputError, PriorError
@@ -257,13 +257,6 @@ def _check_values(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
             )
         if name in kind.covariances:
             check_flat_covariance(name, tensor)
-
-
-def check_flat_covariance(name: str, covariance: Tensor) -> None:
-    """Raise as `check_covariance`, but for covariances without extent in a direction."""
-    cov = covariance.double()
-    size = cov.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
-    check_covariance(name, cov + 1e-7 * size * torch.eye(cov.shape[-1]).to(cov))
 
 
 def _fits(value: Any, hint: Any) -> bool:

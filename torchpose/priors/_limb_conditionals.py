@@ -17,6 +17,7 @@ from torch import Tensor
 from torchpose._core.checks import (
     check_choice,
     check_finite,
+    check_flat_covariance,
     check_rate,
     check_shape,
     check_tensors,
@@ -24,12 +25,7 @@ from torchpose._core.checks import (
 from torchpose._core.module_state import NoHalfModule, derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
-from torchpose._core.tensor_file import (
-    FileKind,
-    check_flat_covariance,
-    read_tensors,
-    write_tensors,
-)
+from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.body._kinematics import Body, centres_of
 from torchpose.errors import FileFormatError, InputError, PriorError
 from torchpose.math._rotation_gaussians import (

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import (
+    check_finite,
+    check_flat_covariance,
+    check_shape,
+    check_tensors,
+)
 from torchpose.errors import InputError
 from torchpose.math._rotations import compose, quaternion_vector_to_matrix
 from torchpose.math._unscented import sigma_points
@@ -60,8 +65,8 @@ def plot_rotations(
         matplotlib `Figure`, a panel for each Gaussian.
 
     Raises:
-        InputError: nothing to draw, something without a name, or no direction. ShapeError: sizes other
-            than these.
+        InputError: nothing to draw, something without a name or that is no Gaussian, or no direction.
+            ShapeError: sizes other than these.
 
     Reference: Daubney & Xie, Figure 3.
     """
@@ -72,11 +77,14 @@ def plot_rotations(
     check_shape("direction", axis, [3])
     if not bool(axis.norm() > 0):
         raise InputError("direction must have a length, got zeros")
+    if not isinstance(draws, int) or draws < 0:
+        raise InputError(f"draws must be a whole number of 0 or more, got {draws!r:.60}")
+    checked = {name: _checked(name, gaussian) for name, gaussian in gaussians.items()}
     columns = min(len(gaussians), _COLUMNS)
     rows = -(-len(gaussians) // columns)
     figure = new_figure(_WIDTH * columns, _WIDTH * rows + 0.6 + 0.4 * (title is not None), title)
     camera = _camera(*view)
-    for index, (name, gaussian) in enumerate(gaussians.items()):
+    for index, (name, gaussian) in enumerate(checked.items()):
         ax = figure.add_subplot(rows, columns, index + 1)
         _sphere(ax, camera)
         _cloud(ax, camera, gaussian, axis / axis.norm(), draws, generator)
@@ -84,6 +92,25 @@ def plot_rotations(
         ax.text(0, 1.13, name, fontsize=NORMAL, color=INK, ha="center")
     add_legend(figure, _legend())
     return figure
+
+
+def _checked(name: str, gaussian: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean, covariance and centre in double precision, or raise for what is no Gaussian."""
+    if not isinstance(gaussian, tuple | list) or len(gaussian) != 3:
+        raise InputError(
+            f"gaussians[{name!r}] must be a mean, a covariance and a centre or None, got "
+            f"{type(gaussian).__name__}"
+        )
+    mean, covariance, centre = gaussian
+    centre = torch.zeros(3) if centre is None else centre
+    values = {"mean": (mean, [3]), "covariance": (covariance, [3, 3]), "centre": (centre, [3])}
+    for what, (value, sizes) in values.items():
+        check_tensors(**{what: value})
+        check_shape(what, value, sizes)
+        check_finite(what, value)
+    check_flat_covariance("covariance", covariance)
+    mean, covariance, centre = (v.detach().cpu().double() for v in (mean, covariance, centre))
+    return mean, covariance, centre
 
 
 def _camera(across: float, above: float) -> Tensor:
@@ -116,16 +143,12 @@ def _sphere(ax: Axes, camera: Tensor) -> None:
 def _cloud(
     ax: Axes,
     camera: Tensor,
-    gaussian: tuple[Tensor, Tensor, Tensor | None],
+    gaussian: tuple[Tensor, Tensor, Tensor],
     direction: Tensor,
     count: int,
     generator: torch.Generator | None,
 ) -> None:
-    mean, covariance = (value.detach().cpu().double() for value in gaussian[:2])
-    centre = torch.zeros(3) if gaussian[2] is None else gaussian[2]
-    centre = centre.detach().cpu().double()
-    check_shape("mean", mean, [3])
-    check_shape("covariance", covariance, [3, 3])
+    mean, covariance, centre = gaussian
 
     def seen(x: Tensor) -> Any:
         """Return the rotated direction: right, up and towards the viewer, [3, ...]."""
