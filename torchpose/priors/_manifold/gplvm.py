@@ -68,11 +68,8 @@ def join_sequences(
             frames in all, or a value that is not finite.
     """
     parts: list[Any] = [poses] if hasattr(poses, "shape") else list(poses)
-    wanted = (
-        dim
-        if dim is not None
-        else next((p.shape[-1] for p in parts if getattr(p, "ndim", 0) == 2), None)
-    )
+    columns_of = (part.shape[-1] for part in parts if getattr(part, "ndim", 0) == 2)
+    wanted = next(columns_of, None) if dim is None else dim
     for number, part in enumerate(parts):
         where = "poses" if hasattr(poses, "shape") else f"sequence {number} of the poses"
         check_tensors(**{where: part})

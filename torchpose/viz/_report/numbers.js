@@ -40,7 +40,7 @@ const isThere = (p, i) => !p.there || p.there[i] === 1;
 const isMeasured = (p, i, joint) =>
   ((p.observed[i * OBSERVED_BYTES + (joint >> 3)] >> (joint & 7)) & 1) === 1;
 
-/** Whether an ellipsoid is drawn: of inferred joints, and of all where outlines measure them together. */
+/** Whether an ellipsoid is drawn: of inferred joints, and of all where all are measured alike, as by outlines. */
 const hasEllipsoid = (p, i, joint) =>
   p.measured.every((share) => share === p.measured[0]) || !isMeasured(p, i, joint);
 
