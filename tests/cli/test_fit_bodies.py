@@ -218,7 +218,7 @@ def test_people_who_stand_still_have_no_action(torchpose, tmp_path):
     for number in range(3):
         states = torch.zeros(60, body.dim, dtype=torch.float64)
         states[:, 1], states[:, 3 + 3 * BODY_15.part("torso")] = 0.9, 0.1 * number
-        write(tmp_path, "p0", number, body, states, 50.0, "still")
+        write_body(tmp_path / f"p0_{number}.npz", body.joints(states), 50.0, "p0", "still")
     done = torchpose("fit", "actions", tmp_path, "--actions", "still", "--out",
                      tmp_path / "still.safetensors", "--fps", 30)  # fmt: skip
     assert done.code == 2 and "there is no motion to learn" in done.err

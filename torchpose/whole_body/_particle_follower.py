@@ -164,17 +164,15 @@ class ParticleFollower:
             NobodySeenError: there is none.
         """
         begun = 0 if measured is None else self.measurer.first_frame(measured)
-        ever = torch.zeros(len(self.cameras), dtype=torch.bool)
+        saw: set[int] = set()  # of what a callable takes there may be as many as it likes
         for t, one in islice(enumerate(frames), begun, None):
             if measured is not None:
                 return t, one
-            seeing = which_see(_masks(one)).cpu()
+            seeing = which_see(_masks(one))
             if bool(seeing.all()):
                 return t, one
-            ever = ever | seeing
-        blind = [
-            name for name, saw in zip(self.cameras.names, ever.tolist(), strict=True) if not saw
-        ]
+            saw.update(seeing.nonzero().flatten().tolist())
+        blind = [name for c, name in enumerate(self.cameras.names) if c not in saw]
         raise NobodySeenError(
             "nobody is seen by all cameras in any frame"
             + (f", and by {', '.join(blind)} in none" if blind else "")
