@@ -21,7 +21,7 @@ from torchpose.errors import InputError, NobodySeenError
 from torchpose.io import Keypoints, write_keypoints
 from torchpose.skeleton._joint_sets import SKELETONS
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
-from torchpose.video import VideoWriter
+from torchpose.video import VideoWriter, open_video
 from torchpose.whole_body import BodyTrack
 
 FPS = 50.0
@@ -367,11 +367,18 @@ def test_the_body_is_drawn_as_a_turned_camera_sees_it(torchpose, scene, tmp_path
     torch.testing.assert_close(turns[-1, 1].double(), in_world, atol=0.01, rtol=0)
 
 
-def test_a_video_that_ends_before_the_keypoints_is_said(track, tmp_path):
+def test_overlays_go_on_where_the_video_of_one_camera_has_ended(track, tmp_path):
     write_grey(tmp_path / "short.mp4", 3)
-    videos = ("--camera-names", "[front]", "--videos", tmp_path / "short.mp4", "--height", "1.75")
-    done = track(tmp_path / "out", "front.npz", *videos, "--pictures", "false")
-    assert done.code == 0 and "a video ends after 3 frames" in done.out
+    inputs, videos = ("front.npz", "behind.npz"), (tmp_path / "short.mp4", "behind.mp4")
+    given = ("--camera-names", "[front,behind]", "--videos", *videos, "--height", "1.75")
+    done = track(tmp_path / "out", *inputs, *given)
+    assert done.code == 0, done.err
+    assert "the video of camera front ends after 3 frames, so its overlay does not" in done.out
+    assert "camera behind ends" not in done.out
+    for name, n_frames in (("front", 3), ("behind", N)):
+        with open_video(tmp_path / "out" / f"overlay_{name}.mp4") as shown:
+            assert sum(1 for _ in shown) == n_frames
+    assert (tmp_path / "out" / "overlay.png").exists()
 
 
 @pytest.mark.usefixtures("undoubted_here")

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -41,11 +42,11 @@ class DrawnVideos(Protocol):
         ...
 
     def images(self) -> Iterator[tuple[Any, ...]]:
-        """Read the frames of all cameras."""
+        """Read the frames of all cameras; None where the video of a camera has ended."""
         ...
 
     def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the bodies that are there."""
+        """Return the images of frame t of all cameras with the bodies that are there; None stays None."""
         ...
 
 
@@ -70,7 +71,7 @@ def draw(
     """Draw all bodies into the frames of every camera: videos, and some frames as one picture.
 
     Returns:
-        The files, and a note if a video ends before the poses do.
+        The files, and a note for each video that ends before the poses do.
     """
     from torchpose.video._writer import VideoWriter
 
@@ -78,7 +79,7 @@ def draw(
     first, end = span_of(people)
     chosen = {round(i * (end - first - 1) / 5) + first for i in range(6)}
     strip: list[list[Any]] = []
-    count = 0
+    counts = [0] * len(films.names)
     with ExitStack() as stack:
         writers = [
             stack.enter_context(VideoWriter(file, films.fps, size))
@@ -87,27 +88,30 @@ def draw(
         for t, images in enumerate(films.images()):
             if t >= end:
                 break
-            count = t + 1
+            counts = [c if x is None else t + 1 for c, x in zip(counts, images, strict=True)]
             if t < first:
                 continue
             if not videos and t not in chosen:
                 continue
             drawn = films.drawn(people, t, images)
             for writer, image in zip(writers, drawn, strict=False):
-                writer.write(image)
+                if image is not None:
+                    writer.write(image)
             if t in chosen:
                 strip.append(drawn)
+    files = [file for file, count in zip(files, counts, strict=False) if count > first]
     if picture and strip:
-        files.append(_write_strip(out / "overlay.png", strip))
-    if count == end:
-        return files, ()
-    return files, (
-        f"a video ends after {counted(count, 'frame')}, so overlays do not show the poses after that",
+        files.append(_write_strip(out / "overlay.png", strip, films.sizes))
+    return files, tuple(
+        f"the video of camera {name} ends after {counted(count, 'frame')}, so its overlay does not show the "
+        "poses after that"
+        for name, count in zip(films.names, counts, strict=True)
+        if count < end
     )
 
 
-def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
-    """Write frames as columns and cameras as rows."""
+def _write_strip(path: Path, strip: list[list[Any]], sizes: Sequence[tuple[int, int]]) -> Path:
+    """Write frames as columns and cameras, of images of these sizes, as rows; black where there is none."""
     import cv2
     import numpy as np
 
@@ -119,7 +123,11 @@ def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
         width = max(1, round(image.shape[1] * height / image.shape[0]))
         return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
-    rows = [np.hstack([small(frame[c]) for frame in strip]) for c in range(len(strip[0]))]
+    black = [np.zeros((rows, columns, 3), np.uint8) for columns, rows in sizes]
+    rows = [
+        np.hstack([small(blank if frame[c] is None else frame[c]) for frame in strip])
+        for c, blank in enumerate(black)
+    ]
     widest = max(row.shape[1] for row in rows)
     rows = [np.pad(row, ((0, 4), (0, widest - row.shape[1]), (0, 0))) for row in rows]
     with atomic_path(path) as temporary:
@@ -221,16 +229,17 @@ class Films:
         return self
 
     def images(self) -> Iterator[tuple[Any, ...]]:
-        """Read the frames of all cameras."""
-        from torchpose.video._silhouettes import frames_in_step
+        """Read the frames of all cameras; None where the video of a camera has ended."""
+        from torchpose.video._silhouettes import skip_frames
 
         with ExitStack() as stack:
             sources = [stack.enter_context(self._open(i)) for i in range(len(self._videos))]
-            for frames in frames_in_step(sources, self._delays):
-                yield tuple(frame.image for frame in frames)
+            skip_frames(sources, self._delays)
+            for frames in zip_longest(*sources):
+                yield tuple(None if frame is None else frame.image for frame in frames)
 
     def drawn(self, people: "Sequence[BodyTrack]", t: int, images: Sequence[Any]) -> list[Any]:
-        """Return the images of frame t of all cameras with the bodies and all keypoints."""
+        """Return the images of frame t of all cameras with the bodies and all keypoints; None stays None."""
         there = [
             (place, poses)
             for place, poses in enumerate(people)
@@ -239,8 +248,11 @@ class Films:
         drawn = list(images)
         for order, (place, poses) in enumerate(there, 1):
             tint = None if len(people) == 1 else place
-            drawn = [self._drawn(image, poses, t, c, tint, order == len(there))
-                     for c, image in enumerate(drawn)]  # fmt: skip
+            drawn = [
+                None if image is None
+                else self._drawn(image, poses, t, c, tint, order == len(there))
+                for c, image in enumerate(drawn)
+            ]  # fmt: skip
         return drawn
 
     def _drawn(

@@ -290,10 +290,15 @@ def frames_in_step(
     Args:
         delays: frames to skip at the beginning of each video.
     """
+    skip_frames(sources, delays)
+    yield from zip(*sources, strict=False)
+
+
+def skip_frames(sources: Sequence[VideoSource], delays: Sequence[int]) -> None:
+    """Read as many frames at the beginning of each video as its delay says."""
     for source, delay in zip(sources, delays, strict=True):
         for _ in range(delay):
             next(source, None)
-    yield from zip(*sources, strict=False)
 
 
 def read_silhouettes(
