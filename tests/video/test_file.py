@@ -107,7 +107,9 @@ def test_reopen_is_a_second_pass(tmp_path):
 def test_after_the_last_frame_there_is_none(tmp_path):
     with open_video(make_video(tmp_path / "a.mp4", 5)) as source:
         assert len(list(source)) == 5
-        assert list(source) == []
+        assert next(source, None) is None
+        with pytest.raises(InputError, match=r"have been read; open it again, or reopen\(\) it"):
+            list(source)
 
 
 # what is no video

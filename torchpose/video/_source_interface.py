@@ -30,9 +30,9 @@ class VideoFrame(NamedTuple):
 class VideoSource(abc.ABC):
     """Yields frames of one size at a constant rate, once, from the first to the last.
 
-    A source is an iterator over `VideoFrame` and a context manager. Findings about the input (a rotated
-    or truncated file, repeated frames) are sentences in `notes`; some are known only after the last
-    frame.
+    A source is an iterator over `VideoFrame` and a context manager. Who begins to read it a second time gets
+    an `InputError`. Findings about the input (a rotated or truncated file, repeated frames) are sentences in
+    `notes`; some are known only after the last frame.
 
     Args:
         name: as given by the user.
@@ -54,7 +54,7 @@ class VideoSource(abc.ABC):
         self.n_frames: int | None = None
         self.notes: list[str] = []
         self._frames: Iterator[VideoFrame] | None = None
-        self._closed = False
+        self._closed = self._ended = False
 
     @abc.abstractmethod
     def _read(self) -> Iterator[VideoFrame]:
@@ -82,6 +82,12 @@ class VideoSource(abc.ABC):
             self._release()
 
     def __iter__(self) -> Iterator[VideoFrame]:
+        if self._ended:
+            again = ", or reopen() it" if self.reopenable else ""
+            raise InputError(
+                f"{self.name}: all frames of this source have been read; open it again{again} to read it once "
+                "more"
+            )
         return self
 
     def __next__(self) -> VideoFrame:
@@ -89,7 +95,11 @@ class VideoSource(abc.ABC):
             raise InputError(f"{self.name}: this source is closed; open it again to read it")
         if self._frames is None:
             self._frames = self._read()
-        return next(self._frames)
+        try:
+            return next(self._frames)
+        except StopIteration:
+            self._ended = True
+            raise
 
     def __enter__(self) -> Self:
         return self
