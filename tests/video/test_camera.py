@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import InputError
 from torchpose.video import _camera as module
 from torchpose.video import open_video
 from torchpose.video._camera import CameraSource
@@ -178,12 +178,24 @@ def test_what_could_not_be_prepared_is_released():
     assert fake.released == 1
 
 
-def test_a_size_that_changes(camera):
+def test_frames_of_another_size_are_scaled_to_the_first(camera):
     source, fake = camera(WARM_UP + 5)
     next(source)
     fake.size = (24, 32)
-    with pytest.raises(FileFormatError, match="expected frames of 64x48"):
-        next(source)
+    assert [frame.image.shape for frame in source] == 4 * [(48, 64, 3)]
+    assert source.notes[0] == "4 frames of camera 3 of another size, scaled to 64x48"
+
+
+def test_a_driver_that_raises_gives_no_frame(camera, monkeypatch):
+    source, fake = camera(WARM_UP + 5)
+    next(source)
+
+    def broken():
+        raise cv2.error("the device has gone")
+
+    monkeypatch.setattr(fake, "read", broken)
+    assert list(source) == []
+    assert "no more frames after 1: unplugged" in source.notes[-1]
 
 
 def test_cannot_be_read_twice(camera):

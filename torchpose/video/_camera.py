@@ -1,10 +1,12 @@
 """Read cameras by OpenCV."""
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
 from torchpose._core.checks import check_rate
+from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError, InputError
 from torchpose.video._source_interface import VideoFrame, VideoSource
 
@@ -44,6 +46,7 @@ class CameraSource(VideoSource):
     The rate is measured over the first frames, which are discarded while the exposure settles. The times
     of the frames are those of the clock. Only the newest frame waits, so that a slow reader misses some.
     They are counted by the clock (`VideoFrame.missed`), and a note tells of them once the source is closed.
+    Frames of another size than the first are scaled to it.
 
     Args:
         index: number of the camera, from 0.
@@ -62,6 +65,7 @@ class CameraSource(VideoSource):
     ) -> None:
         super().__init__(f"camera {index}")
         self._early = _EARLY  # of the time between frames by which one may come before its time
+        self._resized = 0
         if index < 0:
             raise InputError(f"the number of a camera is 0 or more, got {index}")
         if fps is not None:
@@ -108,10 +112,13 @@ class CameraSource(VideoSource):
             self.fps, self._early = fps, 0.5 * fps / self.fps
 
     def _grab(self) -> Any:
+        import cv2
+
         for attempt in range(_PATIENCE):
-            found, image = self._capture.read()
-            if found and image is not None:
-                return image
+            with contextlib.suppress(cv2.error):  # some drivers raise it where others give no frame
+                found, image = self._capture.read()
+                if found and image is not None:
+                    return image
             if attempt + 1 < _PATIENCE:
                 time.sleep(_PAUSE)
         return None
@@ -141,21 +148,30 @@ class CameraSource(VideoSource):
                     f"pauses of more than {_PAUSE_FROM:g} s between frames of {self.name}, which take no "
                     f"time in the results: {n_pauses}"
                 )
+            if self._resized:
+                self.notes.append(
+                    f"{counted(self._resized, 'frame')} of {self.name} of another size, scaled to "
+                    f"{self.size[0]}x{self.size[1]}"
+                )
         self.notes.append(
             f"{self.name} gave no more frames after {n_read}: unplugged, or used by another program"
         )
 
     def _images(self) -> Iterator[tuple[Any, float]]:
         """Yield what the camera gives, and the seconds since the first image."""
+        import cv2
+
         start = None
         while (image := self._grab()) is not None:
             now = time.monotonic()
             start = now if start is None else start
-            if image.ndim != 3 or (image.shape[1], image.shape[0]) != self.size:
+            if image.ndim != 3:
                 raise FileFormatError(
-                    f"{self.name}: expected frames of {self.size[0]}x{self.size[1]}, got an array "
-                    f"of shape {list(image.shape)}"
+                    f"{self.name}: expected frames in colour, got an array of shape {list(image.shape)}"
                 )
+            if (image.shape[1], image.shape[0]) != self.size:
+                self._resized += 1
+                image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
             yield image, now - start
 
     def _note_rate(self, n_read: int, n_frames: int) -> None:

@@ -85,8 +85,8 @@ class VideoSource(abc.ABC):
         if self._ended:
             again = ", or reopen() it" if self.reopenable else ""
             raise InputError(
-                f"{self.name}: all frames of this source have been read; open it again{again} to read it once "
-                "more"
+                f"{self.name}: all frames of this source have been read; open it again{again} to read it "
+                "once more"
             )
         return self
 
