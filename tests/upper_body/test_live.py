@@ -262,6 +262,16 @@ def test_states_of_a_tracker_with_other_options_are_refused(prior, few, method, 
     copy.deepcopy(tracker).step(state, few[:, 1])
 
 
+def test_a_tracker_that_smooths_takes_no_state_of_one_that_does_not(prior, few):
+    tracker, smoother = (
+        UpperBodyTracker(prior, demo_camera(), "mkf-fixed", smoothing=s) for s in (None, 5)
+    )
+    state = tracker.init(len(few), NAMES)
+    for call in (lambda: smoother.step(state, few[:, 0]), lambda: smoother.advance(state, few)):
+        with pytest.raises(InputError, match="expected smoothing=None, got 5"):
+            call()
+
+
 def test_what_no_step_changes_is_computed_once(prior, few, monkeypatch):
     tracker = UpperBodyTracker(prior, demo_camera(), "articulated", neck="mid-shoulder")
     state, _ = tracker.step(tracker.init(len(few), NAMES), few[:, 0])

@@ -395,6 +395,17 @@ def test_bad_keypoints_are_refused(prior, change, error, message):
         UpperBodyTracker(prior, demo_camera())(**{**arguments, **change})
 
 
+def test_peaks_of_heat_maps_count_as_certain(prior):
+    """Also of faces, and of the joints by which bones are lifted."""
+    names = ["nose", "hip_left", *UPPER_BODY]
+    keypoints = 240.0 + 80.0 * torch.rand(1, 3, 10, 2, generator=torch.Generator().manual_seed(0))
+    tracker = UpperBodyTracker(prior, demo_camera(), "articulated")
+    sure, high = torch.ones(1, 3, 10), torch.full((1, 3, 10), 1.3)
+    assert torch.equal(
+        tracker(keypoints, high, names).joints3d, tracker(keypoints, sure, names).joints3d
+    )
+
+
 def test_a_stretch_without_any_measurement_is_bounded(prior):
     keypoints = torch.full((1, 90, 4, 2), 240.0)
     keypoints[:, 15:72] = torch.nan

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import (
+    CONFIDENCE_ADVICE,
+    MOST_CONFIDENCE,
     STAYS_POSITIVE,
     check_covariance,
     check_finite,
@@ -190,7 +192,7 @@ def measured_keypoints(
             or None.
 
     Raises:
-        InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
+        InputError: infinite values, or the confidence of a measured keypoint is below 0 or above 2.
         ShapeError: confidence or mask do not fit the keypoints.
     """
     measured = ~is_filled(keypoints)
@@ -323,6 +325,7 @@ def in_prior_pixels(
     """
     to_prior, _ = kept_pixel_maps(camera, prior)
     there = measured_keypoints(keypoints, confidence, mask)
+    confidence = None if confidence is None else confidence.clamp(max=1.0)
     check_pixels("keypoints", keypoints, there)
     if covariance is not None:
         known = known_covariances(covariance, there, picked.indices, keypoints)
@@ -348,13 +351,13 @@ def in_prior_pixels(
 
 
 def _check_confidence(confidence: Tensor, measured: Bool[Tensor, "B T J"]) -> None:
-    """Refuse a confidence outside [0, 1] of a keypoint that is there; NaN is missing."""
-    outside = measured & ((confidence < 0) | (confidence > 1))
+    """Refuse a confidence below 0 or of another scale of a keypoint that is there; NaN is missing."""
+    outside = measured & ((confidence < 0) | (confidence > MOST_CONFIDENCE))
     if bool(outside.any()):
         b, t, j = outside.nonzero()[0].tolist()
         raise InputError(
             f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(confidence[b, t, j]):g} "
-            f"of keypoint {j} in frame {t} of sequence {b}; scale scores of another range to it"
+            f"of keypoint {j} in frame {t} of sequence {b}; {CONFIDENCE_ADVICE}"
         )
 
 

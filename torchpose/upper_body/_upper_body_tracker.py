@@ -278,7 +278,8 @@ class UpperBodyTracker(WideModule):
             keypoints: [B, T, J, 2], pixels of the camera; NaN where one is missing, or exactly (0, 0) or
                 (-1, -1), as many detectors write.
             confidence: [B, T, J], 0 to 1, by which the measurement covariance is divided, and by which a
-                keypoint may be an outlier (docs/mathematics.md, "Outliers"); 0 or NaN where it is missing.
+                keypoint may be an outlier (docs/mathematics.md, "Outliers"); 0 or NaN where it is missing. Up
+                to 2 it counts as 1, as of peaks of heat maps.
             names: the names of the J joints, in any order and spelling of `torchpose.skeleton`;
                 may be left out if J = 8 and they are in the order of `UPPER_BODY`. Nose, eyes and ears
                 tell "articulated" where the body faces.
@@ -357,11 +358,7 @@ class UpperBodyTracker(WideModule):
             >>> pose.joints3d.shape
             torch.Size([1, 8, 3])
         """
-        if self.smoothing is not None:
-            raise InputError(
-                "frame by frame an estimate cannot use later frames: expected smoothing=None, got "
-                f"{self.smoothing!r}"
-            )
+        self._refuse_smoothing()
         check_count("batch_size", batch_size)
         check_generators(generator, batch_size)
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
@@ -402,8 +399,8 @@ class UpperBodyTracker(WideModule):
             The next state, and the `LivePose` of this frame.
 
         Raises:
-            ShapeError, InputError: wrong shapes, infinite values, or a state of another method, or of a
-            tracker of another frame rate, prior or option.
+            ShapeError, InputError: wrong shapes, infinite values, a tracker that smooths, or a state of
+            another method, or of a tracker of another frame rate, prior or option.
         """
         check_stream(state)
         given = {"confidence": confidence, "mask": mask, "covariance": covariance, "absent": absent}
@@ -439,11 +436,12 @@ class UpperBodyTracker(WideModule):
             The next state, and the poses of these frames.
 
         Raises:
-            ShapeError, InputError: wrong shapes, no frames, infinite values, or a state of another
-            method, or of a tracker of another frame rate, prior or option.
+            ShapeError, InputError: wrong shapes, no frames, infinite values, a tracker that smooths, or a
+            state of another method, or of a tracker of another frame rate, prior or option.
         """
         refuse_export(*_NO_EXPORT)
         check_stream(state)
+        self._refuse_smoothing()
         check_tensors(keypoints=keypoints)
         check_floating("keypoints", keypoints)
         refuse_half("keypoints", keypoints)
@@ -465,6 +463,14 @@ class UpperBodyTracker(WideModule):
         unseen = unseen_frames(state.unseen, found.measured.mask.any(-1))
         state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
         return state, track.in_precision(self.dtype)
+
+    def _refuse_smoothing(self) -> None:
+        """Raise `InputError` where later frames are asked for, which streams do not have."""
+        if self.smoothing is not None:
+            raise InputError(
+                "frame by frame an estimate cannot use later frames: expected smoothing=None, got "
+                f"{self.smoothing!r}"
+            )
 
     @property
     def _settings(self) -> StreamSettings:

@@ -129,6 +129,11 @@ def test_what_a_detector_returns_is_checked(found, said):
         checked_detections(found, 5, "mine")
 
 
+def test_peaks_of_heat_maps_count_as_certain():
+    found = checked_detections((np.full((1, 5, 2), 90.0), np.full((1, 5), 1.02)), 5, "mine")
+    assert found.confidence.tolist() == [[1.0] * 5]
+
+
 def test_shares_of_the_image_are_no_pixels():
     shares, sure = np.linspace(0.2, 0.8, 10).reshape(1, 5, 2), np.ones((1, 5))
     with pytest.raises(InputError, match=r"^mine must return keypoints in pixels, got all of them"):

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import CONFIDENCE_ADVICE, MOST_CONFIDENCE
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 
@@ -76,7 +77,7 @@ def checked_detections(found: Any, n_keypoints: int, detector: str) -> Detection
         detector: its name in messages.
 
     Raises:
-        InputError: not a pair, other shapes, no numbers, no pixels, or a confidence outside 0 to 1.
+        InputError: not a pair, other shapes, no numbers, no pixels, or a confidence below 0 or above 2.
     """
     wanted = f"keypoints [N, {n_keypoints}, 2] and confidence [N, {n_keypoints}] of N persons"
     try:
@@ -89,15 +90,15 @@ def checked_detections(found: Any, n_keypoints: int, detector: str) -> Detection
     if shapes != ([len(keypoints), n_keypoints, 2], [len(keypoints), n_keypoints]):
         raise InputError(f"{detector} must return {wanted}, got {shapes[0]} and {shapes[1]}")
     there = keypoints.isfinite().all(-1) & confidence.isfinite()
-    wrong = there & ((confidence < 0) | (confidence > 1))
+    wrong = there & ((confidence < 0) | (confidence > MOST_CONFIDENCE))
     if bool(wrong.any()):
         raise InputError(
             f"{detector} must return a confidence in 0 to 1, got {float(confidence[wrong][0]):g}; "
-            "scale scores of another range to it"
+            + CONFIDENCE_ADVICE
         )
     _check_pixels(keypoints[there & (confidence > 0)], detector)
     keypoints = torch.where(there[..., None], keypoints, torch.nan)
-    return Detections(keypoints, torch.where(there, confidence, 0.0))
+    return Detections(keypoints, torch.where(there, confidence.clamp(max=1.0), 0.0))
 
 
 def _check_pixels(points: Float[Tensor, "K 2"], detector: str) -> None:
