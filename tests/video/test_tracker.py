@@ -334,6 +334,17 @@ def test_bad_use_is_refused(prior):
     anywhere = VideoTracker(prior, PinholeCamera(525, 525, 320, 240))
     with pytest.raises(InputError, match="20 x 20 pixels, and those before are of 30 x 20"):
         anywhere([small, small[:, :20]])
+    state, _ = anywhere.step(anywhere.init(), small)
+    with pytest.raises(InputError, match="20 x 20 pixels, and those before are of 30 x 20"):
+        anywhere.step(state, small[:, :20])
+    for state in (None, anywhere.tracker.init(1)):
+        with pytest.raises(
+            InputError, match=r"state must be a VideoState, got .*; begin with init"
+        ):
+            anywhere.step(state, small)
+    for image, got in ((None, "NoneType"), (small[..., 0], r"\[20, 30\] of uint8")):
+        with pytest.raises(InputError, match=rf"a frame must be RGB.*, got {got}; cv2.cvtColor"):
+            anywhere.step(anywhere.init(), image)
     for empty in (small[:0], torch.zeros(3, 0, 5, dtype=torch.uint8)):
         with pytest.raises(InputError, match="a frame must be RGB"):
             anywhere([empty])

@@ -27,6 +27,10 @@ _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
 _FASTEST = 1000.0  # frames per second
 _LARGEST_SHARE = 2.0  # of the image; joints may lie outside of it
 _MOST_SKEW = 1e-6  # of a covariance, relative to its largest entry
+_RGB_ADVICE = (
+    "; cv2.cvtColor converts BGR, RGBA and grey, np.asarray a PIL image, and (255 * image).astype(np.uint8) "
+    "values from 0 to 1"
+)
 _SEVERAL = 3  # keypoints that tell whether most are shares
 
 
@@ -158,7 +162,7 @@ def check_pixels(name: str, points: Tensor, there: Tensor) -> None:
 
 def check_rgb(name: str, image: Any, empty: bool = True) -> None:
     """Raise `InputError` unless `image` is an array [H, W, 3] of uint8; `empty` ones may pass."""
-    _check_image(name, image, "RGB, [H, W, 3]", 3, empty)
+    _check_image(name, image, "RGB, [H, W, 3]", 3, empty, _RGB_ADVICE)
 
 
 def check_grey(name: str, image: Any) -> None:
@@ -166,12 +170,15 @@ def check_grey(name: str, image: Any) -> None:
     _check_image(name, image, "grey, [H, W]", None, True)
 
 
-def _check_image(name: str, image: Any, kind: str, channels: int | None, empty: bool) -> None:
+def _check_image(
+    name: str, image: Any, kind: str, channels: int | None, empty: bool, advice: str = ""
+) -> None:
     shape = tuple(getattr(image, "shape", ()))
-    dtype = getattr(image, "dtype", type(image))
+    dtype = getattr(image, "dtype", None)
     fits = len(shape) == (2 if channels is None else 3) and channels in (None, shape[-1])
     if not fits or str(dtype) != "uint8" or (not empty and 0 in shape):
-        raise InputError(f"{name} must be {kind} of uint8, got {list(shape)} of {dtype}")
+        got = f"{list(shape)} of {dtype}" if shape else type(image).__name__
+        raise InputError(f"{name} must be {kind} of uint8, got {got}{advice}")
 
 
 def check_rate(name: str, fps: Any) -> float:

@@ -78,6 +78,7 @@ class VideoState(NamedTuple):
         measurer: the state of the measurer. streams: the states of the persons by number.
         poses: the last poses of the persons in `streams`, without those of filters that degenerated.
         n_frames: the number of frames so far. cuts: those of them that begin another scene.
+        size: (width, height) of these frames; None before the first.
     """
 
     measurer: MeasurerState | KeypointState
@@ -85,6 +86,7 @@ class VideoState(NamedTuple):
     poses: dict[int, PoseTrack]
     n_frames: int = 0
     cuts: tuple[int, ...] = ()
+    size: tuple[int, int] | None = None
 
 
 class LivePerson(NamedTuple):
@@ -258,7 +260,8 @@ class VideoTracker(nn.Module):
             The next state, and the persons seen within the last `max_gap`.
 
         Raises:
-            InputError: an image of another kind or another size than the camera's, or a tracker that smooths.
+            InputError: an image of another kind, or of another size than the camera's or the frames before, a
+            tracker that smooths, or what is no state of it.
         """
         state, tracked = self.advance(state, [image])
         last = {number: tracked[number][-1].last() for number in state.streams}
@@ -281,12 +284,25 @@ class VideoTracker(nn.Module):
             poses, each with the place of its first frame (`start`).
 
         Raises:
-            InputError: an image of another kind or another size than the camera's, a video with another rate
-                than `fps`, or a tracker that smooths.
+            InputError: an image of another kind, or of another size than the camera's or the frames before, a
+                video with another rate than `fps`, a tracker that smooths, or what is no state of it.
         """
         if self.smoother is not None:
             raise InputError("a camera is tracked frame by frame: expected smoothing=None")
-        seen = look_ahead(self._measurer, state.measurer, self._images(images))
+        if not isinstance(state, VideoState):
+            raise InputError(
+                f"state must be a VideoState, got {type(state).__name__}; begin with init, and pass on what "
+                "the step before returned"
+            )
+        size = state.size
+
+        def sized() -> Iterator[tuple[Image, int]]:
+            nonlocal size
+            for image, missed in self._images(images, state.size):
+                size = image.shape[1], image.shape[0]
+                yield image, missed
+
+        seen = look_ahead(self._measurer, state.measurer, sized())
         tracked: dict[int, list[TrackedBlock]] = {}
         place, last = 0, state
         for after, block, poses in self._blocks(state, seen, _BLOCK):
@@ -294,7 +310,7 @@ class VideoTracker(nn.Module):
                 placed = (part._replace(start=place + part.start) for part in parts)
                 tracked.setdefault(number, []).extend(placed)
             place, last = place + len(block.found), after
-        return last, tracked
+        return last._replace(size=size), tracked
 
     @uncompiled
     def forward(
@@ -351,15 +367,21 @@ class VideoTracker(nn.Module):
     if TYPE_CHECKING:  # nn.Module has Any
         __call__ = forward
 
-    def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[tuple[Image, int]]:
-        """Return images, and how many frames were missed before each, once their rate is known."""
+    def _images(
+        self, frames: Iterable[Any] | Tensor, size: tuple[int, int] | None = None
+    ) -> Iterator[tuple[Image, int]]:
+        """Return images, and how many frames were missed before each, once their rate is known.
+
+        Args:
+            frames: see `forward`. size: (width, height) of the frames before, None if there are none.
+        """
         rate = getattr(frames, "fps", None) if getattr(frames, "knows_rate", True) else None
         if rate and abs(rate / self.fps - 1) > _SAME_RATE:
             raise InputError(
                 f"the video has {rate:g} frames per second, and the tracker is for {self.fps:g}; "
                 f"make the tracker with fps={rate:g}, or open the video with fps={self.fps:g}"
             )
-        return _images_of_size(frames, self.tracker.camera.image_size)
+        return _images_of_size(frames, self.tracker.camera.image_size, size)
 
     def _seen(
         self, state: VideoState, frames: Iterable[Any] | Tensor, n_frames: int | None, others: int
@@ -471,10 +493,18 @@ def as_image(image: Any) -> Image:
 
 
 def _images_of_size(
-    frames: Iterable[Any] | Tensor, size: tuple[int, int] | None
+    frames: Iterable[Any] | Tensor,
+    of_camera: tuple[int, int] | None,
+    before: tuple[int, int] | None,
 ) -> Iterator[tuple[Image, int]]:
-    """Yield the images of frames with the numbers missed, all of the size of the camera, or of the first."""
-    given = "the camera is for images" if size is not None else "those before are"
+    """Yield the images of frames with the numbers missed, all of the size of the camera, or of the first.
+
+    Args:
+        frames: with images. of_camera: (width, height) of its images, if it is known.
+        before: of the frames before, None if there are none.
+    """
+    given = "those before are" if of_camera is None else "the camera is for images"
+    size = before if of_camera is None else of_camera
     for frame in frames:
         image = as_image(getattr(frame, "image", frame))
         own = image.shape[1], image.shape[0]
