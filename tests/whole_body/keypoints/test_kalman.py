@@ -799,6 +799,7 @@ def test_a_known_body_keeps_its_bones(four, filtered):
         ({"keypoints": torch.zeros(0, 3, 4, 15, 2)}, InputError, "at least one sequence"),
         ({"names": ["nose"] * 15}, SkeletonError, "nose"),
         ({"confidence": torch.full((T, 4, 15), -1.0)}, InputError, "in \\[0, 1\\]"),
+        ({"confidence": torch.full((T, 4, 15), math.inf)}, InputError, "got inf of camera '"),
         ({"confidence": torch.ones(T, 4, 3)}, ShapeError, "confidence"),
         ({"covariance": torch.zeros(T, 4, 15)}, InputError, "covariance"),
         ({"covariance": torch.full((T, 4, 15), math.inf)}, InputError, "got inf of camera '"),
@@ -823,6 +824,36 @@ def test_keypoints_of_another_image_size_are_refused(four):
     few = third[:4].clone()
     few[:, 2, :8] = four.keypoints[:4, 2, :8]
     assert len(kalman(four.rig)(keypoints=few)) == len(few)
+
+
+@pytest.mark.parametrize("persons", [None, "all"])
+def test_a_live_frame_of_outliers_alone_is_no_error(persons):
+    """In a stream that runs, one keypoint far outside an image may be all that a camera has."""
+    two = scene(2, 12)
+    live, keypoints = kalman(two.rig), two.keypoints.clone()
+    keypoints[10] = torch.nan
+    keypoints[10, 0, 3] = 6000.0
+    frames, poses = keypoints if persons is None else keypoints[:, :, None], []
+    state = live.init()
+    for frame in frames:
+        state, pose = live.step(state, keypoints=frame, persons=persons)
+        poses.append(pose if persons is None else pose[:1])
+    with pytest.raises(CameraError, match="lie outside its image of 1920 x 1080"):
+        live.step(live.init(), keypoints=frames[10], persons=persons)
+    if persons is None:
+        assert bool(poses[10].coasting) and not bool(poses[11].coasting)
+    last = poses[11] if persons is None else poses[11][0]
+    assert errors(last, two.joints[11:]).mean() < 0.04
+
+
+@pytest.mark.parametrize("n_cameras", [1, 2])
+def test_a_keypoint_that_no_image_can_have_is_missing(n_cameras):
+    """A detector may write numbers of memory that it has not filled."""
+    seen = scene(n_cameras, 8)
+    live, without, wild = kalman(seen.rig), seen.keypoints.clone(), seen.keypoints.clone()
+    without[4, 0, 3], wild[4, 0, 3] = torch.nan, 1e300
+    found, expected = (live(keypoints=one).joints3d for one in (wild, without))
+    assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize("persons", [None, "all"])

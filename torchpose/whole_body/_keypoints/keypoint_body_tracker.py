@@ -212,11 +212,11 @@ class KeypointBodyTracker(nn.Module):
     ) -> tuple[LiveBody, BodyTrack]:
         """Track one more frame; see `BodyTracker.step`."""
         check_shape("keypoints", keypoints, [len(self.rig), None, 2])
-        given = self.reader.frames_and_feet(keypoints, confidence, names, covariance)
-        frame, feet = mapped(lambda value: value[None], given)
         before, standing = (None, None) if stream is None else stream
-        body, pose, _ = self.tracker.advance(before, frame)
         followed = before is not None and bool(before.begun)
+        given = self.reader.frames_and_feet(keypoints, confidence, names, covariance, followed)
+        frame, feet = mapped(lambda value: value[None], given)
+        body, pose, _ = self.tracker.advance(before, frame)
         if bool(body.begun) and not followed:
             self.check_cameras(frame.map(lambda value: value[:, None]))
         found = None

@@ -1,5 +1,6 @@
 """Read the keypoints of a detector as pixels of the body's joints and feet, with their noise and trust."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -25,6 +26,10 @@ from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
 _MANY = 150  # keypoints, which tell the size of images
 _BEYOND = 0.1  # share of keypoints to the right of an image, and below it
+_FARTHEST = (
+    5.0  # longer sides of the image away from its corner, from which on a keypoint is nobody's
+)
+_LONGEST_SIDE = 10_000  # pixels, of an image whose size is not known
 _STDS = (1e-3, 1e6)  # pixels; beyond, matrices are not positive definite in rounding
 
 
@@ -45,6 +50,8 @@ class KeypointReader:
                 f"pixel_std must lie between {_STDS[0]:g} and {_STDS[1]:g} pixels, got {pixel_std}"
             )
         self.rig, self.keypoint_std, self.pixel_std = rig, keypoint_std, pixel_std
+        sides = [max(size or (_LONGEST_SIDE,)) for size in rig.sizes]
+        self._farthest = _FARTHEST * torch.tensor(sides, dtype=torch.float64)[:, None, None]
 
     def frames_and_feet(
         self,
@@ -52,10 +59,16 @@ class KeypointReader:
         confidence: Tensor | None,
         names: Sequence[str] | None,
         covariance: Tensor | None,
+        fitting: bool = False,
     ) -> tuple[KeypointFrame, KeypointFrame | None]:
         """Return keypoints of `BODY_15`'s joints, and of `FEET` if the names have some of them.
 
         They are undistorted, with their noise and trust.
+
+        Args:
+            keypoints, confidence, names, covariance: as `BodyTracker.forward`.
+            fitting: whether keypoints before these have shown that they are of the cameras' images; then a
+                frame of outliers is no error.
         """
         refuse_half("keypoints", keypoints)
         names = _names_of(keypoints, names)
@@ -71,7 +84,8 @@ class KeypointReader:
         table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
         table = table.masked_fill(~there[..., None], torch.nan)
         body, feet = body_joints(table, names), foot_points(table, names)
-        self._check_inside(_pixels_of(body))
+        if not fitting:
+            self._check_inside(_pixels_of(body))
         if len(self.rig) == 1:  # of several, how they agree tells it
             self._check_size(body)
         if feet is None:
@@ -91,7 +105,7 @@ class KeypointReader:
         """Return how far keypoints are trusted, from 0, of those that are missing, to 1."""
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
         known = torch.isfinite(points).all(-1) & ~is_filled(points)
-        trust = trust.nan_to_num(0.0) * known
+        trust = torch.where(known, trust.nan_to_num(0.0, math.inf, -math.inf), 0.0)
         outside = (trust < 0) | (trust > MOST_CONFIDENCE)
         if bool(outside.any()):
             raise InputError(
@@ -125,7 +139,9 @@ class KeypointReader:
 
     def _undistorted(self, table: Float[Tensor, "*batch C J 5"]) -> KeypointFrame:
         """Return keypoints of a table of pixels, both parts of the noise, and trust."""
-        pixels = self.rig.undistort_points(_pixels_of(table))
+        points = _pixels_of(table)
+        far = (points.abs() > self._farthest.to(points)).any(-1, keepdim=True)
+        pixels = self.rig.undistort_points(points.masked_fill(far, torch.nan))
         known = pixels.isfinite().all(-1)  # some pixels are of no ray through the lens
         own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
         return KeypointFrame(

@@ -125,7 +125,8 @@ class PeopleBodyTracker:
     ) -> tuple[LivePeople, list[BodyTrack]]:
         """Track one more frame; return the poses of those who are confirmed persons by now."""
         check_shape("keypoints", keypoints, [len(self.single.rig), "D", None, 2])
-        frame, seen = self._frames(keypoints, confidence, names, covariance)
+        known = stream is not None and stream.people.n_confirmed > 0
+        frame, seen = self._frames(keypoints, confidence, names, covariance, known)
         after, found = self.people.advance(None if stream is None else stream.people, frame)
         if found is None:
             return LivePeople(after, None, None), []
@@ -159,10 +160,12 @@ class PeopleBodyTracker:
         confidence: Tensor | None,
         names: Sequence[str] | None,
         covariance: Tensor | None,
+        fitting: bool = False,
     ) -> tuple[KeypointFrame, KeypointFrame | None]:
         """Return the detections of bodies and of feet as frames [..., D, C, J]."""
         trust, cov = (None if v is None else v.transpose(-3, -2) for v in (confidence, covariance))
-        both = self.single.reader.frames_and_feet(keypoints.transpose(-4, -3), trust, names, cov)
+        points = keypoints.transpose(-4, -3)
+        both = self.single.reader.frames_and_feet(points, trust, names, cov, fitting)
         body, feet = (
             one if one is None or one.inlier.shape[-3] else _with_an_empty_one(one) for one in both
         )
