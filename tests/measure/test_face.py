@@ -1,5 +1,8 @@
 """Face tracks against single Kalman filters, and the detector on recordings of signers."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -210,6 +213,24 @@ def test_bad_input_is_refused():
         tracker.update(tracker.init(), torch.tensor([[1.0, float("nan"), 2.0]]))
     with pytest.raises(ShapeError):
         tracker.update(tracker.init(), torch.zeros(1, 4))
+
+
+def test_threads_that_share_a_detector_search_one_after_the_other():
+    """OpenCV's cascade keeps the image that it searches; another search meanwhile ended in its own error."""
+    detector, inside, most = HaarFaceDetector(), [], []
+
+    class Cascade:
+        def detectMultiScale(self, *_, **__):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.01)
+            inside.pop()
+            return ()
+
+    detector._cascade = Cascade()
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(detector, [np.zeros((40, 40), np.uint8)] * 4))
+    assert most == [1] * 4
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])

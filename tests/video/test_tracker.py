@@ -1,5 +1,6 @@
 """Persons of a video who leave, return and cross, rendered."""
 
+import copy
 import math
 import sys
 import weakref
@@ -265,6 +266,20 @@ def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one
         live += [found.pose.joints3d[0, 0] for found in people]
     whole = person.track.joints3d[0]
     torch.testing.assert_close(torch.stack(live[: len(whole)]), whole, rtol=1e-9, atol=1e-9)
+
+
+def test_a_background_is_of_one_stream(prior):
+    camera, image = PinholeCamera.from_image_size(64, 48), np.full((48, 64, 3), 90, np.uint8)
+    tracker = VideoTracker(prior, camera, method="mkf-fixed", background=True)
+    one, other = tracker.init(), tracker.init()
+    one, _ = tracker.step(one, image)
+    with pytest.raises(InputError, match="next frame is 1, got frame 0; make a tracker for each"):
+        tracker.step(other, image)
+    one, _ = tracker.step(one, image)
+    copied, _ = copy.deepcopy(tracker).step(one, image)  # which learns the background anew
+    assert copied.n_frames == tracker.step(one, image)[0].n_frames == 3
+    assert tracker.step(tracker.init(), image)[0].n_frames == 1
+    assert tracker([image] * 3) == []
 
 
 def test_what_tracking_leaves_behind_serves_gradients(prior, one_person):

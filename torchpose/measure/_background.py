@@ -128,6 +128,21 @@ class BackgroundModel:
         self._faceless = 0  # frames in a row without a face
         self._region: Any = None
         self._shape: tuple[int, ...] | None = None
+        self.next_frame: int | None = None
+
+    def step_in_order(self, number: int, frame: Image, faces: Float[Tensor, "N 3"]) -> Image:
+        """Return `step` of a frame, which must follow the one before; the first may have any number.
+
+        Raises:
+            InputError: another frame, as of a second stream.
+        """
+        if self.next_frame not in (None, number):
+            raise InputError(
+                f"background=True keeps the background of one stream, whose next frame is {self.next_frame}, "
+                f"got frame {number}; make a tracker for each stream, and track each frame once"
+            )
+        self.next_frame = number + 1
+        return self.step(frame, faces)
 
     def step(self, frame: Image, faces: Float[Tensor, "N 3"]) -> Image:
         """Return the foreground of the next frame: uint8 [H, W], 255 on the foreground, 0 elsewhere.

@@ -1,5 +1,6 @@
 """Detect faces in grey images by OpenCV's cascade of Viola & Jones (Burke & Lasenby, section 5.1)."""
 
+from threading import Lock
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -93,14 +94,14 @@ class HaarFaceDetector:
             )
         self.scale_factor, self.min_size = scale_factor, min_size
         self.min_neighbours = min_neighbours
-        self._cascade = _frontal_faces()
+        self._cascade, self._searching = _frontal_faces(), Lock()
 
     def __getstate__(self) -> dict[str, Any]:
         # OpenCV's classifier can be neither copied nor pickled
-        return self.__dict__ | {"_cascade": None}
+        return self.__dict__ | {"_cascade": None, "_searching": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__ = state | {"_cascade": _frontal_faces()}
+        self.__dict__ = state | {"_cascade": _frontal_faces(), "_searching": Lock()}
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
         """Return the faces of a grey image; see `FaceDetector`."""
@@ -124,10 +125,11 @@ class HaarFaceDetector:
         self, image: Image, smallest: int, largest: int, neighbours: int
     ) -> Float[Tensor, "N 3"]:
         """Return the faces between two sizes."""
-        boxes = self._cascade.detectMultiScale(
-            np.ascontiguousarray(_brightened(image)), self.scale_factor, neighbours,
-            minSize=(smallest,) * 2, maxSize=(max(smallest, largest),) * 2,
-        )  # fmt: skip
+        with self._searching:  # the cascade keeps the image that it searches
+            boxes = self._cascade.detectMultiScale(
+                np.ascontiguousarray(_brightened(image)), self.scale_factor, neighbours,
+                minSize=(smallest,) * 2, maxSize=(max(smallest, largest),) * 2,
+            )  # fmt: skip
         found = np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
         found = found[np.lexsort(found.T[:3])]  # threads of OpenCV end in any order
         corners, size = torch.from_numpy(found).split([2, 2], 1)

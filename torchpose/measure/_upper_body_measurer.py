@@ -136,7 +136,7 @@ class UpperBodyMeasurer(CpuModule):
         fps: frames per second.
         hands: "learnt" (`HandTracker` with the network that comes along), "grid" (without it) or
             "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
-        background: whether to detect the foreground, for a static camera.
+        background: whether to detect the foreground, for a static camera, and of one stream at a time.
         elbows: whether to measure elbows: by the network, or without one where the torso with its sleeves
             is widest. By default they are measured if hands are "learnt".
         face_detector: by default Haar's.
@@ -230,7 +230,9 @@ class UpperBodyMeasurer(CpuModule):
         if self.max_persons is not None:
             rows = largest_persons(number, faces[:, 2], seen.followed, self.max_persons)
             faces, face_cov, number = faces[rows], face_cov[rows], number[rows]
-        foreground = None if self.background is None else self.background.step(image, faces)
+        foreground = None
+        if self.background is not None:
+            foreground = self.background.step_in_order(seen.frame, image, faces)
         windows, hands = seen.windows, None
         if isinstance(self.hand_tracker, HandTracker) and windows is not None:
             windows, hands = self.hand_tracker.look(windows, image, faces, number, foreground)

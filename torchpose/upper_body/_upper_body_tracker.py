@@ -388,6 +388,7 @@ class UpperBodyTracker(WideModule):
         A camera does not stop, so `max_gap` raises nothing here: while nothing is measured the prior
         fills in, covariances grow, and `LivePose.unseen` says for how long it has been so. Frames
         that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
+        Keypoints of a network are to be detached, or the state holds the graph of all frames before.
 
         Args:
             state: the state from `init` or the step before; it is not changed, so a step may be repeated

@@ -127,7 +127,8 @@ class VideoTracker(nn.Module):
             this one.
         hands: the hand tracker: "learnt" (default), "grid" (without its network) or "mean-shift", the
             paper's method.
-        background: detect the foreground, for a static camera.
+        background: detect the foreground, for a static camera. The background is kept in the tracker, which
+            then serves one stream, each frame once.
         elbows: measure elbows: by the network, or without one where the torso with its sleeves is widest.
             By default they are measured if hands are "learnt".
         edges: correct swapped hands by the edges of the arms (`HandAssociation`); takes about twice
