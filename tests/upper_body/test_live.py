@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from torchpose import PinholeCamera
 from torchpose.camera._virtual_camera import Regression
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError, SkeletonError
@@ -156,8 +157,18 @@ def test_a_neck_of_another_kind_is_converted_here_too(prior, few):
     track = tracker(few, names=NAMES)
     state, poses = stream(tracker, few)
     check_equal(poses, track)
-    assert state.picked.notes == track.notes != ()
+    assert state.picked.notes == state.notes == track.notes != ()
     assert tracker.advance(tracker.init(len(few), NAMES), few[:, :2])[1].notes == track.notes
+
+
+def test_a_stream_says_what_it_assumes(prior, few):
+    camera = PinholeCamera(525, 525, 319.5, 239.5, 640, 480, distortions=(-0.2, 0.05))
+    tracker = UpperBodyTracker(prior, camera, "mkf-fixed", outliers=False)
+    names = ["wrist_" + name[5:] if "hand" in name else name for name in NAMES]
+    state = tracker.init(len(few), names)
+    assert any("distortions are not applied" in note for note in state.notes)
+    assert any("wrists" in note for note in state.notes)
+    assert tracker.step(state, few[:, 0])[0].notes == state.notes == tracker(few, names=names).notes
 
 
 def test_a_stream_goes_on_while_nothing_is_seen_and_says_for_how_long(prior, keypoints):

@@ -25,6 +25,7 @@ class StreamState(NamedTuple):
         screen: state of the outlier screening; None without any.
         method: the name of the method whose state it is. settings: of the tracker whose state it is, as far
             as the numbers depend on them; None if they are not known.
+        notes: what was assumed of the keypoints of the stream, as in `PoseTrack.notes`.
     """
 
     estimator: Any
@@ -35,6 +36,7 @@ class StreamState(NamedTuple):
     screen: ScreenState | None = None
     method: str | None = None
     settings: StreamSettings | None = None
+    notes: tuple[str, ...] = ()
 
 
 class LivePose(NamedTuple):

@@ -343,7 +343,8 @@ class UpperBodyTracker(WideModule):
                 missing in any frame. generator: as in `forward`; the state holds it.
 
         Returns:
-            `StreamState` before the first frame.
+            `StreamState` before the first frame. Its `notes` say what is assumed, such as that wrists stand
+            for hands or that the camera's distortions are not applied.
 
         Raises:
             InputError: a tracker that smooths, no stream. SkeletonError: unknown names.
@@ -370,8 +371,9 @@ class UpperBodyTracker(WideModule):
             state = reader.estimator.init(batch_size, joints, arms)
         unseen = torch.zeros(batch_size, dtype=torch.long, device=cov.device)
         return StreamState(
-            state, None, unseen, n_keypoints, picked, method=reader.method, settings=self._settings
-        )
+            state, None, unseen, n_keypoints, picked, method=reader.method, settings=self._settings,
+            notes=reader.notes,
+        )  # fmt: skip
 
     @uncompiled
     def step(
