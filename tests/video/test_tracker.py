@@ -227,7 +227,8 @@ def test_only_the_largest_face_is_followed_if_asked_for(prior, two_persons):
 
 
 @pytest.mark.parametrize("edges", [False, True])
-def test_images_are_held_for_edges_alone(prior, edges):
+def test_images_are_held_for_edges_alone(prior, edges, monkeypatch):
+    monkeypatch.setattr("torchpose.video._video_tracker.AHEAD", 4)  # small ones may wait in numbers
     there, held = set(), []
 
     def frames():
@@ -357,6 +358,11 @@ def test_bad_use_is_refused(prior):
             InputError, match=r"state must be a VideoState, got .*; begin with init"
         ):
             anywhere.step(state, small)
+    for missed in (-1, 2.5, None):
+        frame = CameraFrame(small, 0.0, 0)
+        frame.missed = missed
+        with pytest.raises(InputError, match="missed must be a whole number of frames, 0 or more"):
+            anywhere.step(anywhere.init(), frame)
     for image, got in ((None, "NoneType"), (small[..., 0], r"\[20, 30\] of uint8")):
         with pytest.raises(InputError, match=rf"a frame must be RGB.*, got {got}; cv2.cvtColor"):
             anywhere.step(anywhere.init(), image)

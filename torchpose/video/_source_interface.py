@@ -54,7 +54,7 @@ class VideoSource(abc.ABC):
         self.n_frames: int | None = None
         self.notes: list[str] = []
         self._frames: Iterator[VideoFrame] | None = None
-        self._closed = self._ended = False
+        self._closed = self._exhausted = False
 
     @abc.abstractmethod
     def _read(self) -> Iterator[VideoFrame]:
@@ -82,7 +82,7 @@ class VideoSource(abc.ABC):
             self._release()
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        if self._ended:
+        if self._exhausted:
             again = ", or reopen() it" if self.reopenable else ""
             raise InputError(
                 f"{self.name}: all frames of this source have been read; open it again{again} to read it "
@@ -98,7 +98,7 @@ class VideoSource(abc.ABC):
         try:
             return next(self._frames)
         except StopIteration:
-            self._ended = True
+            self._exhausted = True
             raise
 
     def __enter__(self) -> Self:

@@ -4,6 +4,7 @@ import math
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
@@ -515,7 +516,10 @@ def _images_of_size(
                 f"a frame is of {own[0]} x {own[1]} pixels, and {given} of {size[0]} x {size[1]}; give the "
                 "camera of the frames, or frames of one size"
             )
-        yield image, getattr(frame, "missed", 0)
+        missed = getattr(frame, "missed", 0)
+        if not isinstance(missed, Integral) or missed < 0:
+            raise InputError(f"missed must be a whole number of frames, 0 or more, got {missed!r}")
+        yield image, int(missed)
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:

@@ -39,12 +39,11 @@ from torchpose.whole_body._body_track import BodyTrack, load_body
 from torchpose.whole_body._filter_table import BodyTrackerOptions
 from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
-from torchpose.whole_body._following import Observed
 from torchpose.whole_body._keypoints.camera_tilt import CameraTilt, find_camera_tilt
 from torchpose.whole_body._keypoints.keypoint_body_tracker import KeypointBodyTracker, LiveBody
 from torchpose.whole_body._keypoints.people_body_tracker import LivePeople, PeopleBodyTracker
 from torchpose.whole_body._keypoints.track_builder import KEYPOINT_METHOD
-from torchpose.whole_body._measured_keypoints import given_keypoints
+from torchpose.whole_body._measured_keypoints import GivenKeypoints, given_keypoints
 from torchpose.whole_body._particle_follower import ParticleFollower, set_up_particles
 
 _N_PARTICLES = 1000
@@ -446,7 +445,7 @@ class BodyTracker(OwnPrecisionModule):
             given = None if given is None else given.alone()
             check_tensors(silhouettes=silhouettes)
             shown = None if silhouettes is None else [silhouettes]
-            return self._tracked(state, self._by_particles.observed(shown, given)[0])
+            return self._tracked(state, shown, given)
         check_tensors(keypoints=keypoints, confidence=confidence, covariance=covariance)
         keypoints = keypoints_alone(self.method, silhouettes, keypoints)
         if isinstance(state.filter, BodyFilterState):
@@ -492,7 +491,7 @@ class BodyTracker(OwnPrecisionModule):
         if self.by_keypoints is not None:
             raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         given = given_keypoints(keypoints, confidence, names, covariance)
-        return self._tracked(state, self._by_particles.observed(silhouettes, given)[0])
+        return self._tracked(state, silhouettes, given)
 
     def find_tilt(self, tracks: Sequence[BodyTrack]) -> CameraTilt | None:
         """Find by how much the only camera looks up and is rolled, from how people stand in front of it.
@@ -534,9 +533,13 @@ class BodyTracker(OwnPrecisionModule):
         return state.names if names is None else names
 
     def _tracked(
-        self, state: BodyStream, frames: Iterable[Observed]
+        self,
+        state: BodyStream,
+        silhouettes: Iterable[Bool[Tensor, "C H W"]] | None,
+        given: GivenKeypoints | None,
     ) -> tuple[BodyStream, BodyTrack]:
         """Return the next state and the poses in some frames, by particles."""
+        frames, _ = self._by_particles.observed(silhouettes, given, fitting=state.frame > 0)
         if not isinstance(state.filter, BodyFilterState):
             raise InputError(f"expected the state of a tracker with method {self.method}")
         after, poses = self._by_particles.follow(state.filter, frames, state.generator, state.frame)

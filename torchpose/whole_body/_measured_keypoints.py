@@ -76,14 +76,17 @@ class BodyKeypointMeasurer:
             rig, fps, body=body, keypoint_std=keypoint_std, pixel_std=pixel_std
         )
 
-    def measured(self, given: GivenKeypoints) -> KeypointFrame:
+    def measured(self, given: GivenKeypoints, fitting: bool = False) -> KeypointFrame:
         """Return the keypoints of T frames [T, C, 15, ...], with their noise and trust.
+
+        Args:
+            given: the keypoints. fitting: as `KeypointReader.frames_and_feet`.
 
         Raises:
             ShapeError, InputError, CameraError: as `BodyTracker.forward`.
         """
         check_shape("keypoints", given.keypoints, ["T", len(self.tracker.rig), None, 2])
-        return self.tracker.reader.frames_and_feet(*given)[0]
+        return self.tracker.reader.frames_and_feet(*given, fitting=fitting)[0]
 
     def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
         """Return the measurement of one frame, of one element."""

@@ -113,12 +113,16 @@ class ParticleFollower:
         return poses
 
     def observed(
-        self, silhouettes: Iterable[Any] | None, given: GivenKeypoints | None
+        self,
+        silhouettes: Iterable[Any] | None,
+        given: GivenKeypoints | None,
+        fitting: bool = False,
     ) -> tuple[Iterator[Observed], KeypointFrame | None]:
         """Return the frames one after the other, and the keypoints of all of them.
 
         Args:
             silhouettes: [C, H, W], frame after frame. given: keypoints of as many frames.
+            fitting: as `KeypointReader.frames_and_feet`.
 
         Raises:
             InputError: neither of them, or keypoints beside a likelihood of one's own.
@@ -133,7 +137,7 @@ class ParticleFollower:
             raise InputError(
                 "a callable likelihood takes observations of its own; leave out the keypoints"
             )
-        measured = self.measurer.measured(given)
+        measured = self.measurer.measured(given, fitting)
         outlined = None if silhouettes is None else self._frames(silhouettes)
         return observed_frames(outlined, self.measurer, measured), measured
 

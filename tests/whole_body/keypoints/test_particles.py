@@ -10,7 +10,7 @@ from tests.whole_body.keypoints.scenes import errors, ring, scene
 from torchpose import BodyTracker
 from torchpose.body import BODY_15, Body
 from torchpose.body._skeleton import other_side
-from torchpose.errors import InputError, NobodySeenError, ShapeError
+from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeError
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.particle_likelihood import (
     KeypointMeasurement,
@@ -249,6 +249,17 @@ def test_a_live_stream_begins_with_the_pose_that_one_camera_tells():
     seen.keypoints[:, :, 5:] = math.nan
     with pytest.raises(NobodySeenError, match="in any camera"):
         tracker.init(keypoints=seen.keypoints)
+
+
+def test_a_live_frame_of_outliers_alone_is_no_error():
+    seen = scene(cameras=1, n_frames=2)
+    tracker = BodyTracker(seen.rig, "sir", height=1.7, n_particles=20)
+    state = tracker.init(keypoints=seen.keypoints, generator=torch.Generator().manual_seed(0))
+    wild = {"keypoints": torch.full_like(seen.keypoints[1], 6000.0)}
+    with pytest.raises(CameraError, match="lie outside its image"):
+        tracker.step(state, **wild)
+    state, _ = tracker.step(state, keypoints=seen.keypoints[0])
+    assert bool(tracker.step(state, **wild)[1].joints3d.isfinite().all())
 
 
 def test_bad_keypoints_are_refused():
