@@ -332,6 +332,11 @@ def test_files_of_older_releases_do_not_say_what_ran(prior, scene, tmp_path):
         ({"method": "mkf-fixed", "steady": True}, InputError, "steady=True needs"),
         ({"frame": "world"}, InputError, "camera"),
         ({"fps": 0.0}, InputError, "fps"),
+        (
+            {"fps": 1 / 30},
+            InputError,
+            r"at least 0.1 .* give 1 / 0.0333 for frames that are 0.0333 s",
+        ),
         ({"measurement_std": 0.0}, InputError, "positive"),
         ({"measurement_std": [1.0, 2.0]}, ShapeError, "measurement_std"),
         ({"n_particles": 10}, InputError, "pf-mixture, pf-walk, pf-walk-unscaled"),

@@ -196,6 +196,7 @@ def test_a_frame_counts_if_every_camera_sees_somebody():
         ("constrained", {"action": 3}, "action must be an ActionSpace or ActionBank or the name"),
         ("constrained", {"action": "exercises", "posture_body": 1.75}, "posture_body must be a"),
         ("constrained", {"action": "exercises", "max_redraws": 1.5}, "max_redraws must be a whole"),
+        (None, {"fps": 1 / 30}, "1 / 0.0333 for frames that are 0.0333 s apart"),
     ],
 )
 def test_what_does_not_go_together_is_refused(method, options, said):

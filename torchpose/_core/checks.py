@@ -24,7 +24,7 @@ CONFIDENCE_ADVICE = "divide scores in percent by 100, and take the sigmoid of lo
 """What to do with confidences of another scale."""
 STAYS_POSITIVE = "what is learnt stays positive as the exponential of a parameter"
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres, of a person
-_FASTEST = 1000.0  # frames per second
+_FASTEST, _SLOWEST = 1000.0, 0.1  # frames per second
 _LARGEST_SHARE = 2.0  # of the image; joints may lie outside of it
 _MOST_SKEW = 1e-6  # of a covariance, relative to its largest entry
 _RGB_ADVICE = (
@@ -193,6 +193,19 @@ def check_rate(name: str, fps: Any) -> float:
             f"{name} must be positive and at most {_FASTEST:g} frames per second, got {fps!r:.60}"
         )
     return float(fps)
+
+
+def check_tracked_rate(fps: Any) -> None:
+    """Raise `InputError` unless this is a rate at which somebody can be followed.
+
+    Lower ones are seconds per frame that were given in place of frames per second.
+    """
+    rate = check_rate("fps", fps)
+    if rate < _SLOWEST:
+        raise InputError(
+            f"fps must be at least {_SLOWEST:g} frames per second to follow anybody, got {fps!r}; give "
+            f"1 / {rate:.3g} for frames that are {rate:.3g} s apart"
+        )
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_rate
+from torchpose._core.checks import check_tracked_rate
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._virtual_camera import BodyView
 from torchpose.errors import CameraError, PriorError
@@ -86,7 +86,7 @@ def check_model(
             f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
         )
     if fps is not None:
-        check_rate("fps", fps)
+        check_tracked_rate(fps)
     if camera is None:
         raise CameraError(
             "a camera is needed, got None; pass camera=PinholeCamera(fx, fy, cx, cy), "

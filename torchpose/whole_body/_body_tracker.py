@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 
-from torchpose._core.checks import check_rate, check_tensors
+from torchpose._core.checks import check_tensors, check_tracked_rate
 from torchpose._core.facade import set_up_facade
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import OwnPrecisionModule, as_one_run
@@ -168,7 +168,7 @@ class BodyTracker(OwnPrecisionModule):
         **options: Unpack[BodyTrackerOptions],
     ) -> None:
         super().__init__()
-        check_rate("fps", fps)
+        check_tracked_rate(fps)
         check_person(body, height)
         check_kind("motion", motion, BodyMotion)
         given = given_of({"manifold": manifold, "conditionals": conditionals, "action": action})
