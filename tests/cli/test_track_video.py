@@ -227,6 +227,18 @@ def test_the_first_interruption_ends_the_recording_and_the_second_is_real():
         assert list(items) == []
 
 
+def test_other_signals_end_a_recording_too_where_they_are_named():
+    def frames():
+        yield 0
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield 1
+
+    before = signal.getsignal(signal.SIGTERM)
+    with UntilInterrupted(frames(), signals=(signal.SIGINT, signal.SIGTERM)) as items:
+        assert list(items) == [0] and items.interrupted
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
 def test_a_recording_that_was_stopped_says_so(clip, track, monkeypatch):
     read = FileSource._read
 

@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
@@ -15,20 +15,30 @@ class UntilInterrupted(Generic[T]):
 
     A context manager, to be used in the main thread; the items may be taken in another.
 
+    Args:
+        items: to be passed on. stop: asked before each.
+        signals: that count as Ctrl-C.
+
     Attributes:
         count: items so far. interrupted: whether items were left out.
     """
 
-    def __init__(self, items: Iterable[T], stop: Callable[[], bool] = lambda: False) -> None:
-        self._items, self._stop = items, stop
+    def __init__(
+        self,
+        items: Iterable[T],
+        stop: Callable[[], bool] = lambda: False,
+        signals: Sequence[signal.Signals] = (signal.SIGINT,),
+    ) -> None:
+        self._items, self._stop, self._signals = items, stop, signals
         self.count, self.interrupted, self._asked = 0, False, False
 
     def __enter__(self) -> Self:
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self._before = [signal.signal(one, self._interrupt) for one in self._signals]
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        for one, before in zip(self._signals, self._before, strict=True):
+            signal.signal(one, before)
 
     def __iter__(self) -> Iterator[T]:
         for item in self._items:

@@ -1,6 +1,7 @@
 """`torchpose track` on video: a file, a folder of images, or a camera."""
 
 import contextlib
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from torchpose.video._writer import VideoWriter
 
 _OVERLAY = "overlay.mp4"
+_STOPPING = (signal.SIGINT, signal.SIGTERM)  # what a camera gave is nowhere else
 _THROUGHOUT = 0.9  # share of the frames in which a face is seen that nobody doubts
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
 
@@ -242,7 +244,8 @@ def _track_camera(
             if writers:
                 _record(writers, drawn)
 
-        frames = stack.enter_context(UntilInterrupted(source, lambda: view.stop_requested))
+        stop = UntilInterrupted(source, lambda: view.stop_requested, _STOPPING)
+        frames = stack.enter_context(stop)
         people = tracker(frames, progress=show_progress(), folder=out, watch=watch)
     return people, frames.count, n_frames
 
