@@ -1,6 +1,7 @@
 """Persons of a recording: who comes, goes and returns, from scripted measurements."""
 
 import functools
+import weakref
 
 import pytest
 import torch
@@ -130,6 +131,22 @@ def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(
         person.track.joints3d[0, back:], anew.joints3d[0], rtol=1e-9, atol=1e-9
     )
     assert person.track.failed_at.tolist() == [-1]
+
+
+def test_single_frames_of_a_camera_are_kept_in_few_tensors(quick_tracker, keypoints):
+    """One of a frame takes kilobytes, which were some 500 MB in an hour."""
+    stream, there = PersonStream(quick_tracker, MEASURED), []
+    (block,) = stream.advance_all({}, frames(keypoints[:1], [[0]]), (), GAP)[1][0]
+    kept = TrackedRecording(quick_tracker, MEASURED, GAP)
+    for t in range(100):
+        measured = block.measured._replace(keypoints=keypoints[None, t].clone())
+        there.append(weakref.ref(measured.keypoints))
+        kept.append({0: [block._replace(measured=measured)]}, 1)
+        del measured
+    assert sum(one() is not None for one in there) < 32
+    (person,) = kept.finish()
+    expected = keypoints[:100]
+    torch.testing.assert_close(person.keypoints, expected, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.fixture(scope="module")

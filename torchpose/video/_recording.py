@@ -34,7 +34,10 @@ from torchpose.video._person_stream import (
 )
 
 LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
-_WRITTEN = 32  # poses that are written together: opening the files takes longer than writing a pose
+_WRITTEN = (
+    32  # poses that are written together: opening the files takes longer than writing a pose;
+)
+# and parts of the measurements that are joined
 
 
 class PoseSpool:
@@ -162,9 +165,22 @@ class _Person:
     number: int
     first_frame: int
     poses: PoseSpool
-    measured: list[Measured] = field(default_factory=list)
     last_seen: int = 0
     n_seen: int = 0
+    _parts: list[Measured] = field(default_factory=list)
+    _n_single: int = 0  # the last parts, which are not joined yet
+
+    def keep(self, measured: Measured) -> None:
+        """Keep the measurements in the next frames, in few tensors: one of a single frame takes kilobytes."""
+        self._parts.append(measured)
+        self._n_single += 1
+        if self._n_single == _WRITTEN:
+            joined = _joined(self._parts[-_WRITTEN:])
+            self._parts[-_WRITTEN:], self._n_single = [joined], 0
+
+    def measured(self, count: int) -> Measured:
+        """Return the measurements in the first frames."""
+        return _joined(self._parts).frames(slice(count))
 
 
 class TrackedRecording:
@@ -211,9 +227,9 @@ class TrackedRecording:
         absent = place - len(person.poses)
         if absent:
             detected = part.measured.confidence is not None
-            person.measured.append(unmeasured(absent, len(self.names), detected))
+            person.keep(unmeasured(absent, len(self.names), detected))
             person.poses.append(_nobody(absent, self.tracker))
-        person.measured.append(part.measured)
+        person.keep(part.measured)
         person.poses.append(part.poses)
         seen = torch.nonzero(part.measured.seen).flatten()
         if len(seen):
@@ -239,8 +255,7 @@ class TrackedRecording:
     ) -> TrackedPerson:
         """Return the poses until the person was last seen."""
         count = person.last_seen + 1
-        fields = (_joined(parts, count) for parts in zip(*person.measured, strict=True))
-        measured = Measured(*fields)  # type: ignore[arg-type]
+        measured = person.measured(count)
         found = TrackedPerson(
             person.number, person.first_frame, person.poses.track(count), measured.keypoints,
             measured.covariance, measured.confidence, measured.absent,
@@ -306,10 +321,10 @@ def with_note_on_cuts(track: PoseTrack, cuts: Sequence[int]) -> PoseTrack:
     return replace(track, notes=(*track.notes, note))
 
 
-def _joined(parts: Sequence[Tensor | None], count: int) -> Tensor | None:
-    """Return the first frames of the joined parts; None if these are not measured."""
-    there = [part for part in parts if part is not None]
-    return torch.cat(there)[:count] if there else None
+def _joined(parts: Sequence[Measured]) -> Measured:
+    """Return the measurements in all frames of some parts; None of what none of them has."""
+    fields = ([one for one in values if one is not None] for values in zip(*parts, strict=True))
+    return Measured(*(torch.cat(there) if there else None for there in fields))  # type: ignore[arg-type]
 
 
 def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
