@@ -40,7 +40,7 @@ class PretendedCamera:
 
 def use_camera(monkeypatch, camera: PretendedCamera) -> None:
     """Let the command open this camera, whose clock is the only one."""
-    clock = SimpleNamespace(monotonic=lambda: camera.now, sleep=lambda seconds: None)
+    clock = SimpleNamespace(perf_counter=lambda: camera.now, sleep=lambda seconds: None)
     monkeypatch.setattr("torchpose.video._camera.time", clock)
     monkeypatch.setattr(
         "torchpose.video.open_video",

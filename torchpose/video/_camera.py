@@ -94,7 +94,7 @@ class CameraSource(VideoSource):
             image = self._grab()
             if image is None:
                 raise InputError(f"camera {index} opens but gives no frames; is it in use?")
-            moments.append(time.monotonic())
+            moments.append(time.perf_counter())
             self.size = (image.shape[1], image.shape[0])
         span = moments[-1] - moments[2]  # the first frames are late
         measured = (len(moments) - 3) / span if span > 0 else 0.0
@@ -158,12 +158,15 @@ class CameraSource(VideoSource):
         )
 
     def _images(self) -> Iterator[tuple[Any, float]]:
-        """Yield what the camera gives, and the seconds since the first image."""
+        """Yield what the camera gives, and the seconds since the first image.
+
+        The usual clock, `time.monotonic`, ticks 64 times a second on Windows before Python 3.13.
+        """
         import cv2
 
         start = None
         while (image := self._grab()) is not None:
-            now = time.monotonic()
+            now = time.perf_counter()
             start = now if start is None else start
             if image.ndim != 3:
                 raise FileFormatError(
