@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -531,21 +532,29 @@ def test_smoothing_sums_over_all_later_paths():
     directions = torch.nn.functional.normalize(directions, dim=-1).flatten(-2)
     said = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
     prior = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
-    arms = [Arms(d[:, :, None], w.log()[:, :, None], p.log()[:, :, None])
+    rays = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(1, 2, 1, 3)
+    arms = [Arms(d[:, :, None], w.log()[:, :, None], p.log()[:, :, None], hand_rays=rays)
             for d, w, p in zip(directions, said, prior, strict=True)]  # fmt: skip
     hands = torch.tensor([[[1, 1]], [[1, 0]], [[0, 0]], [[1, 1]]]).bool()  # measured or not
-    states = [chain.start(arms[0], hands[0])]
-    for arm, seen in zip(arms[1:], hands[1:], strict=True):
-        states.append(chain.update(states[-1], arm, seen))
+    elbows = torch.tensor([[[1, 1]], [[0, 1]], [[0, 0]], [[1, 0]]]).bool()
+    known = torch.stack([elbows, hands], -1)
+    states = [chain.start(arms[0], known[0])]
+    for arm, ends in zip(arms[1:], known[1:], strict=True):
+        states.append(chain.update(states[-1], arm, ends))
+    guessed = torch.tensor([[[0, 0]], [[1, 0]], [[0, 0]], [[0, 1]]]).bool()[..., None]
+    assert [
+        bool(((state.pull == 1) == ~own).all()) for state, own in zip(states, guessed, strict=True)
+    ]
 
     def moves(t):
         pair = directions[t - 1 : t + 1].flatten(1, 2)
+        walk, unseen = (chain._walk(*pair, step)[None] for step in (chain.step, chain.step_unseen))
+        pull = states[t].pull[:, :, None]
+        pulled = walk * pull / ((walk * pull) @ said[t, ..., None]) * (walk @ said[t, ..., None])
         seen, unseen = (
-            (1 - anew) * chain._walk(*pair, step)[None] + anew * prior[t, :, :, None]
-            for step, anew in (
-                (chain.step, chain.anew), (chain.step_unseen, chain.anew_unseen)
-            )
-        )  # fmt: skip
+            (1 - anew) * moved + anew * prior[t, :, :, None]
+            for moved, anew in ((pulled, chain.anew), (unseen, chain.anew_unseen))
+        )
         return torch.where(hands[t, :, :, None, None], seen, unseen)
 
     def brute(first, last):
@@ -568,6 +577,43 @@ def test_smoothing_sums_over_all_later_paths():
         for t in range(end + 1):
             last = end if lag is None else min(end, t + lag)
             torch.testing.assert_close(found[t].weight, brute(t, last))
+
+
+def test_elbows_that_nobody_sees_stay_where_people_have_them():
+    """A random walk forgets the prior: elbows of hands before the other shoulder drift to the side."""
+    joints = body(1)[0]
+    bone = torch.tensor([[0.28, 0.84, -0.33], [-0.68, -0.44, -0.51]], dtype=torch.float64)
+    bone = torch.nn.functional.normalize(bone, dim=-1) * torch.tensor([[0.2686], [0.2888]])
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        ends = (bone * bone.new_tensor([sign, 1.0, 1.0])).cumsum(0)
+        places = joints[ROW[f"shoulder_{side}"]] + ends
+        joints[ROW[f"elbow_{side}"]], joints[ROW[f"hand_{side}"]] = places
+    names = ("head", "neck", "hand_left", "hand_right")
+    seen = pixels(joints.expand(45, -1, -1), 2.0)[None][:, :, [ROW[name] for name in names]]
+    found = tracker()(seen, names=names).joints3d[0, 30:]
+    for side in ("left", "right"):
+        off = bones(found, side)[0] - bones(joints, side)[0]
+        assert float(off.norm(dim=-1).mean()) < 0.065  # the walk alone: 0.084 and 0.073
+
+
+def test_the_pull_of_elbows_leaves_the_evidence_and_hands_as_they_are():
+    """It is that of the elbow given the hand: hypotheses one by one as deep are not pulled at all."""
+    chain = ArticulatedFilter(TrackerModel(tracker(), PRIOR, tracker().measurement_cov, 30.0)).chain
+    generator = torch.Generator().manual_seed(0)
+    draw = partial(torch.rand, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(draw(1, 2, 1, 40, 2, 3) - 0.5, dim=-1).flatten(-2)
+    prior, likelihood, rays = draw(1, 2, 1, 40), draw(1, 2, 1, 40), draw(1, 2, 1, 3)
+    rays = torch.nn.functional.normalize(rays, dim=-1)
+    arms = Arms(directions, likelihood.log(), prior.log(), hand_rays=rays)
+    hand, both = (torch.tensor([[[elbow, 1]] * 2]).bool() for elbow in (0, 1))
+    before = chain.start(arms, both)
+    alone, pulled = (chain.update(before, arms, known) for known in (both, hand))
+    assert bool((pulled.weight != alone.weight).all())
+    torch.testing.assert_close(pulled.log_evidence, alone.log_evidence)
+    few = Arms(
+        directions[..., :1, :], likelihood[..., :1].log(), prior[..., :1].log(), hand_rays=rays
+    )
+    torch.testing.assert_close(chain.update(before, few, hand).pull, torch.ones(1, 2, 1).double())
 
 
 def test_ellipsoids_grow_while_an_arm_is_not_measured():

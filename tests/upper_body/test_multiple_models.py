@@ -155,7 +155,7 @@ def test_smoothed_odds_rest_on_clues_before_and_after(prior, monkeypatch):
         torch.testing.assert_close(share, expected, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(("depth", "nearer"), [(0.1, 0.0), (-0.04, 0.6), (-0.2, 0.8)])
+@pytest.mark.parametrize(("depth", "nearer"), [(0.1, 0.0), (-0.04, 0.6), (-0.2, 1.2)])
 def test_log_odds_are_those_of_the_equation(depth, nearer):
     generator = torch.Generator().manual_seed(0)
     d, *x = 0.2 * torch.randn(3, 50, generator=generator, dtype=torch.float64) - 0.1
@@ -186,7 +186,7 @@ def test_arms_that_change_their_length_and_small_bodies_tell_against_windows():
     changing = neck + (same - neck) * (1.0 + 0.3 * (torch.arange(20) % 2))[:, None, None]
     cases = (same, changing, 0.9 * same, 1.1 * same)
     odds = [float(_log_odds(clues_of(ours, same).sum(1))) for ours in cases]
-    assert odds[1] < odds[0] - 0.5 and odds[2] == pytest.approx(odds[0] - 0.8)
+    assert odds[1] < odds[0] - 0.5 and odds[2] == pytest.approx(odds[0] - 1.2)
     assert odds[3] == pytest.approx(odds[0])
 
 
@@ -223,7 +223,7 @@ def test_before_an_arm_is_measured_windows_are_themselves(prior):
     keypoints = of_stranger(12)
     keypoints[:, :8, 2:] = torch.nan
     share, off = shares(prior, keypoints)
-    assert float(off) < 1e-9 and bool(((share > 0.1) & (share < 1)).all())
+    assert float(off) < 1e-9 and bool(((share > 0.05) & (share < 1)).all())
 
 
 def test_a_stream_holds_windows_as_the_whole_recording_does(prior):

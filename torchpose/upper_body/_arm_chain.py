@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import NamedTuple, cast
+from itertools import repeat
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,6 +36,7 @@ _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose h
 _LATER = 0.25
 _RATE = 30.0
 _LEAST = 1e-30  # density
+_SAME_PLACE = 0.15  # of the depths of hands in one place, in lengths of a bone
 # Pairs of directions for each hypothesis from which on, and share of them at most of which, densities are
 # computed pair by pair.
 _MANY, _FEW = 4, 2
@@ -80,12 +82,14 @@ class Arms(NamedTuple):
         log_weight: the log of the likelihood times the node's share of the directions, [B, 2, M, N].
         log_prior: the log-density of the prior, [B, 2, M, N].
         log_told: the part of `log_weight` that lifted bones say, [B, 2, M, N]; None without any.
+        hand_rays: the rays of the hands, upright axes, [B, 2, M, 3]; None while roots are weighed.
     """
 
     directions: Tensor
     log_weight: Tensor
     log_prior: Tensor
     log_told: Tensor | None = None
+    hand_rays: Tensor | None = None
 
     @property
     def log_evidence(self) -> Float[Tensor, "B 2 M"]:
@@ -109,6 +113,9 @@ class ArmState(NamedTuple):
         prior, predicted: the density of the prior, and that predicted from the frames before, at each
             hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
+        pull: the root of the density of the elbow given the hand at each hypothesis, [B, 2, N]; 1 where the
+            elbow is measured or the hand is not.
+        around: the mean of `pull` about each hypothesis of the frame before, [B, 2, N].
     """
 
     directions: Tensor
@@ -117,6 +124,21 @@ class ArmState(NamedTuple):
     prior: Tensor
     predicted: Tensor
     seen: Tensor
+    pull: Tensor
+    around: Tensor
+
+
+class _Pull(NamedTuple):
+    """Pull of elbows that are not measured to where people have them when the hand is there.
+
+    Attributes:
+        root: the root of the density of the elbow given the hand at each hypothesis, up to a factor,
+            [B, 2, N]; 1 where the elbow is measured or the hand is not.
+        weighed: the likelihood of each hypothesis times that, and by itself, [B, 2, 2, N].
+    """
+
+    root: Tensor
+    weighed: Tensor
 
 
 class ArmChain:
@@ -129,6 +151,11 @@ class ArmChain:
 
     An arm whose hand is not measured moves less (s = 5 degrees, e = 0.02 at 30 frames a second, else 10 and
     0.2): what is not seen is best expected where it was. Above 30 frames a second steps are not smaller.
+
+    A walk forgets the prior. So an elbow that is not measured is pulled to where people have it when the hand
+    is there: the walk has a factor, by the density c of the elbow given the hand,
+
+        c(x')^1/2 / a(x),   a(x) the mean of c^1/2 about x.
 
     Args:
         density: the log-density of the prior over directions. fps: frames per second.
@@ -163,10 +190,8 @@ class ArmChain:
             rows = (known == known.new_tensor(ends)).all(-1).nonzero()[:, 0]
             parts.append((rows, self._weighed(arm, ends, sizes[ends], count, rows)))
         order = torch.cat([rows for rows, _ in parts]).argsort()
-        told = arm.bones is not None
-        columns = zip(
-            *(cast(tuple[Tensor, ...], x if told else x[:3]) for _, x in parts), strict=True
-        )
+        n_fields = 3 if arm.bones is None else 4
+        columns = zip(*(cast(tuple[Tensor, ...], x[:n_fields]) for _, x in parts), strict=True)
         joined = (torch.cat(values, 1)[:, order] for values in columns)
         return Arms(*(value.view(*arm.known.shape[:2], *value.shape[2:]) for value in joined))
 
@@ -280,20 +305,20 @@ class ArmChain:
         return arms.log_evidence.sum(1) + tied.log()
 
     @staticmethod
-    def start(arms: Arms, seen: Bool[Tensor, "B 2"]) -> ArmState:
+    def start(arms: Arms, known: Bool[Tensor, "B 2 2"]) -> ArmState:
         """Return the posterior after the first frame, given one hypothesis of the root.
 
         Args:
-            arms: the hypotheses. seen: whether the hands are measured.
+            arms: the hypotheses. known: whether elbow and hand of both arms are measured.
         """
         prior = arms.log_prior[:, :, 0].exp()
-        return _belief(arms, prior, prior, seen)
+        return _belief(arms, prior, prior, known[..., 1])
 
     def update(
         self,
         state: ArmState,
         arms: Arms,
-        seen: Bool[Tensor, "B 2"],
+        known: Bool[Tensor, "B 2 2"],
         again: Bool[Tensor, " B"] | None = None,
     ) -> ArmState:
         """Return the posterior after one more frame; see `start`.
@@ -301,12 +326,19 @@ class ArmChain:
         Args:
             again: whose arms start again, as if it were their first frame; None is nobody.
         """
-        prior = arms.log_prior[:, :, 0].exp()
-        moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0], seen)
+        prior, (elbow, seen) = arms.log_prior[:, :, 0].exp(), known.unbind(-1)
+        pull = _pull(arms, prior, seen & ~elbow)
+        directions = arms.directions[:, :, 0]
+        moved, around = self._moved(state.weight, state.directions, directions, seen, pull)
+        if pull is not None:
+            moved = pull.root * moved
         predicted = moved + self._anew(seen, prior) * (prior - moved)
         if again is not None:
             predicted = torch.where(again[:, None, None], prior, predicted)
-        return _belief(arms, prior, predicted, seen)
+        belief = _belief(arms, prior, predicted, seen)
+        if pull is None or around is None:
+            return belief
+        return belief._replace(pull=pull.root, around=around)
 
     def _anew(self, seen: Bool[Tensor, "B 2"], like: Tensor) -> Float[Tensor, "B 2 1"]:
         """Return the share of each arm that is reinitialised in a frame."""
@@ -349,7 +381,9 @@ class ArmChain:
             after: the backward message at the next frame.
         """
         ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
-        moved = self._moved(ratio, later.directions, state.directions, later.seen)
+        pulled = later.pull * ratio
+        moved, _ = self._moved(pulled, later.directions, state.directions, later.seen)
+        moved = moved / later.around
         drawn = (later.prior * ratio).sum(-1, keepdim=True)
         message = moved + self._anew(later.seen, moved) * (drawn - moved)
         return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
@@ -360,25 +394,41 @@ class ArmChain:
         before: Tensor,
         after: Float[Tensor, "B 2 M 6"],
         seen: Bool[Tensor, "B 2"],
-    ) -> Float[Tensor, "B 2 M"]:
-        """Return sum_n w_n t_4(x'_m; x_n, s^2) for the directions x of two frames."""
-        if bool(seen.all()):
-            return self._walked(weight, before, after, self.step)
-        unseen = self._walked(weight, before, after, self.step_unseen)
+        pull: _Pull | None = None,
+    ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"] | None]:
+        """Return sum_n w_n t_4(x'_m; x_n, s^2) / a_n for the directions x of two frames, and a.
+
+        Args:
+            pull: that to x', for a; without it a is 1, and None.
+        """
         if not bool(seen.any()):
-            return unseen
-        return torch.where(seen[..., None], self._walked(weight, before, after, self.step), unseen)
+            return self._walked(weight, before, after, self.step_unseen)
+        moved, around = self._walked(weight, before, after, self.step, pull)
+        if not bool(seen.all()):
+            unseen, _ = self._walked(weight, before, after, self.step_unseen)
+            moved = torch.where(seen[..., None], moved, unseen)
+        return moved, around
 
     @classmethod
     def _walked(
-        cls, weight: Float[Tensor, "B 2 N"], before: Tensor, after: Tensor, step: float
-    ) -> Float[Tensor, "B 2 M"]:
-        parts = (part.flatten(0, 1).split(_ARMS) for part in (weight[:, :, None], before, after))
-        moved = [
-            torch.bmm(share, cls._walk(old, new, step))
-            for share, old, new in zip(*parts, strict=True)
-        ]
-        return torch.cat(moved).view(*after.shape[:-1])
+        cls,
+        weight: Float[Tensor, "B 2 N"],
+        before: Tensor,
+        after: Float[Tensor, "B 2 M 6"],
+        step: float,
+        pull: _Pull | None = None,
+    ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"] | None]:
+        pulls = None if pull is None else pull.weighed
+        moved, means = [], []
+        for share, old, new, own in _some_arms(weight[:, :, None], before, after, pulls):
+            walk = cls._walk(old, new, step)
+            if own is not None:
+                pulled, alone = torch.bmm(own, walk.mT).split(1, 1)
+                means.append(pulled / alone)
+                share = share / means[-1]
+            moved.append(torch.bmm(share, walk))
+        around = torch.cat(means).view_as(weight) if means else None
+        return torch.cat(moved).view(*after.shape[:-1]), around
 
     @staticmethod
     def _walk(
@@ -459,15 +509,64 @@ def _given_later(state: ArmState, message: Float[Tensor, "B 2 N"]) -> ArmState:
     return state._replace(weight=weight / weight.sum(-1, keepdim=True))
 
 
+def _some_arms(*values: Tensor | None) -> Iterator[tuple[Any, ...]]:
+    """Yield values of both arms of B bodies, `_ARMS` arms at a time; None where there are none."""
+    chunks = [repeat(None) if x is None else x.flatten(0, 1).split(_ARMS) for x in values]
+    yield from zip(*chunks, strict=False)
+
+
+def _pull(arms: Arms, prior: Float[Tensor, "B 2 N"], guessed: Bool[Tensor, "B 2"]) -> _Pull | None:
+    """Return the pull of the elbows that are guessed from their hands; None if there are none.
+
+    The density of the elbow given the hand is that of the prior, over its mean where the hand is as deep.
+    """
+    if arms.hand_rays is None or not bool(guessed.any()):
+        return None
+    likelihood = torch.softmax(arms.log_weight[:, :, 0], -1)
+    hands = arms.directions[:, :, 0].unflatten(-1, (2, 3)).sum(-2)
+    depth = (hands @ arms.hand_rays[:, :, 0, :, None])[..., 0]
+    mean, whole = _sums_as_deep(torch.stack([likelihood * prior, likelihood], -1), depth).unbind(-1)
+    alone = torch.ones_like(prior)
+    root = torch.where(guessed[..., None], (prior * whole / mean.clamp_min(_LEAST)).sqrt(), alone)
+    return _Pull(root, likelihood[:, :, None] * torch.stack([root, alone], 2))
+
+
+def _sums_as_deep(
+    values: Float[Tensor, "B 2 N K"], depth: Float[Tensor, "B 2 N"]
+) -> Float[Tensor, "B 2 N K"]:
+    """Return the sum of values of the hypotheses that are as deep, for each hypothesis.
+
+    They are summed at even depths, with linear weights to either side.
+
+    Args:
+        values: of each hypothesis. depth: of its hand, in lengths of a bone.
+    """
+    most = math.ceil(2 / _SAME_PLACE) + 1  # two bones, and what rounding adds
+    place = depth.flatten() / _SAME_PLACE + most
+    low = place.floor()
+    farther = (place - low)[:, None]
+    count, (n_arms, size) = 2 * most + 1, (len(place) // depth.shape[-1], values.shape[-1])
+    rows = low.long() + count * torch.arange(n_arms, device=low.device).repeat_interleave(
+        depth.shape[-1]
+    )
+    flat = values.reshape(-1, size)
+    sums = flat.new_zeros(count * n_arms, size)
+    sums = sums.index_add(0, rows, (1 - farther) * flat).index_add(0, rows + 1, farther * flat)
+    return torch.lerp(sums[rows], sums[rows + 1], farther).view(values.shape)
+
+
 def _belief(
     arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"], seen: Bool[Tensor, "B 2"]
 ) -> ArmState:
+    """Return the posterior, without any pull."""
     log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(_LEAST).log()
     total = evidence = torch.logsumexp(log_weight, -1)
     if arms.log_told is not None:
         evidence = torch.logsumexp(log_weight - arms.log_told[:, :, 0], -1)
     weight = (log_weight - total[..., None]).exp()
-    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted, seen)
+    nowhere = torch.ones_like(weight)
+    directions = arms.directions[:, :, 0]
+    return ArmState(directions, weight, evidence, prior, predicted, seen, nowhere, nowhere)
 
 
 def _axes_of_spheres(axes: Float[Tensor, "B M 3 3"]) -> Float[Tensor, "B 2 M 3 3"]:

@@ -417,11 +417,10 @@ class ArticulatedFilter(Estimator):
         found = apart((arms, middle, shoulders, (middle @ tilt.mT)[:, 0]), len(frames))
         for frame, here, own in zip(frames, states, found, strict=True):
             own_arms, own_middle, own_shoulders, place = own
-            hands = frame.limbs[..., 1]
             belief = (
-                self.chain.start(own_arms, hands)
+                self.chain.start(own_arms, frame.limbs)
                 if belief is None
-                else self.chain.update(belief, own_arms, hands, again)
+                else self.chain.update(belief, own_arms, frame.limbs, again)
             )
             seen = _Seen(
                 frame, facts, here.tilt, state.sizes, state.lengths, before, state.moments, roots,

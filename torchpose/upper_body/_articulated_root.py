@@ -154,7 +154,8 @@ class RootStep(NamedTuple):
         self, frame: UprightFrame, root: Root, shoulders: Float[Tensor, "B 2 M 3"], sizes: Sizes
     ) -> Arms:
         """Return the hypotheses about both arms for each hypothesis of the root."""
-        return self.chain.hypotheses(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
+        arm = _arm_input(frame, root, shoulders, sizes.metres, sizes.slack)
+        return self.chain.hypotheses(arm)._replace(hand_rays=arm.rays[..., 1, :])
 
     def evidence_of_lengths(
         self,

@@ -47,7 +47,7 @@ _FIRST = 1.0  # log-odds of windows without any clue
 _EVIDENCE_SHARE = 0.5
 _LENGTH_SPREAD = 0.1  # of the log of arms' lengths; by windows, more than this tells against them
 # For each e-fold by which windows put a body nearer than bones do, and at most.
-_NEARNESS_WEIGHT, _MOST_NEARNESS = 15.0, 0.8
+_NEARNESS_WEIGHT, _MOST_NEARNESS = 15.0, 1.2
 _USUAL_TIME = 0.25  # seconds of usual frames that clues begin with
 _USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
@@ -84,7 +84,7 @@ class MultipleModelFilter(Estimator):
         d_s = sum_arms log p_windows(z_s | ...) - log p_articulated(z_s | ...)
         x_s = log(length of the arm by windows / by bones)
         y_s = log(depth of the neck by windows / by bones)
-        l_t = 1 + 0.5 E[d] - log(1 + Var[x] / 0.1^2) - min(0.8, 15 max(0, -E[y]))
+        l_t = 1 + 0.5 E[d] - log(1 + Var[x] / 0.1^2) - min(1.2, 15 max(0, -E[y]))
 
     with means E and variances Var, over both arms, of weights a^(t-s), a = e^(-1 / (4 s f)). They begin as
     if a quarter of a second with d = y = 0 and Var[x] = 0.06^2 had preceded.
