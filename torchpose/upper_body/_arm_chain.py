@@ -16,6 +16,7 @@ from torchpose._core.module_state import outside_inference
 from torchpose.upper_body._absence import log_beyond
 from torchpose.upper_body._arm_reach import loss_beyond_reach
 from torchpose.upper_body._direction_density import DirectionDensity
+from torchpose.upper_body._guessed_elbows import ElbowPull, pull_of_elbows
 from torchpose.upper_body._lifted_arms import LiftedBones
 from torchpose.upper_body._limb_nodes import (
     LimbNodes,
@@ -36,7 +37,6 @@ _STEP_UNSEEN, _ANEW_UNSEEN = math.radians(5.0), 0.02  # the same of arms whose h
 _LATER = 0.25
 _RATE = 30.0
 _LEAST = 1e-30  # density
-_SAME_PLACE = 0.15  # of the depths of hands in one place, in lengths of a bone
 # Pairs of directions for each hypothesis from which on, and share of them at most of which, densities are
 # computed pair by pair.
 _MANY, _FEW = 4, 2
@@ -113,9 +113,8 @@ class ArmState(NamedTuple):
         prior, predicted: the density of the prior, and that predicted from the frames before, at each
             hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
-        pull: the root of the density of the elbow given the hand at each hypothesis, [B, 2, N]; 1 where the
-            elbow is measured or the hand is not.
-        around: the mean of `pull` about each hypothesis of the frame before, [B, 2, N].
+        pull: `ElbowPull.root`, 1 for arms without it. around: its mean about each hypothesis of the frame
+            before, [B, 2, N].
     """
 
     directions: Tensor
@@ -126,19 +125,6 @@ class ArmState(NamedTuple):
     seen: Tensor
     pull: Tensor
     around: Tensor
-
-
-class _Pull(NamedTuple):
-    """Pull of elbows that are not measured to where people have them when the hand is there.
-
-    Attributes:
-        root: the root of the density of the elbow given the hand at each hypothesis, up to a factor,
-            [B, 2, N]; 1 where the elbow is measured or the hand is not.
-        weighed: the likelihood of each hypothesis times that, and by itself, [B, 2, 2, N].
-    """
-
-    root: Tensor
-    weighed: Tensor
 
 
 class ArmChain:
@@ -152,10 +138,8 @@ class ArmChain:
     An arm whose hand is not measured moves less (s = 5 degrees, e = 0.02 at 30 frames a second, else 10 and
     0.2): what is not seen is best expected where it was. Above 30 frames a second steps are not smaller.
 
-    A walk forgets the prior. So an elbow that is not measured is pulled to where people have it when the hand
-    is there: the walk has a factor, by the density c of the elbow given the hand,
-
-        c(x')^1/2 / a(x),   a(x) the mean of c^1/2 about x.
+    An elbow that is not measured is pulled to where people have it when their hand is there
+    (`pull_of_elbows`).
 
     Args:
         density: the log-density of the prior over directions. fps: frames per second.
@@ -327,8 +311,10 @@ class ArmChain:
             again: whose arms start again, as if it were their first frame; None is nobody.
         """
         prior, (elbow, seen) = arms.log_prior[:, :, 0].exp(), known.unbind(-1)
-        pull = _pull(arms, prior, seen & ~elbow)
-        directions = arms.directions[:, :, 0]
+        directions, pull = arms.directions[:, :, 0], None
+        if arms.hand_rays is not None:
+            rays, likelihood = arms.hand_rays[:, :, 0], arms.log_weight[:, :, 0]
+            pull = pull_of_elbows(directions, prior, likelihood, rays, seen & ~elbow)
         moved, around = self._moved(state.weight, state.directions, directions, seen, pull)
         if pull is not None:
             moved = pull.root * moved
@@ -394,7 +380,7 @@ class ArmChain:
         before: Tensor,
         after: Float[Tensor, "B 2 M 6"],
         seen: Bool[Tensor, "B 2"],
-        pull: _Pull | None = None,
+        pull: ElbowPull | None = None,
     ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"] | None]:
         """Return sum_n w_n t_4(x'_m; x_n, s^2) / a_n for the directions x of two frames, and a.
 
@@ -416,7 +402,7 @@ class ArmChain:
         before: Tensor,
         after: Float[Tensor, "B 2 M 6"],
         step: float,
-        pull: _Pull | None = None,
+        pull: ElbowPull | None = None,
     ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"] | None]:
         pulls = None if pull is None else pull.weighed
         moved, means = [], []
@@ -513,46 +499,6 @@ def _some_arms(*values: Tensor | None) -> Iterator[tuple[Any, ...]]:
     """Yield values of both arms of B bodies, `_ARMS` arms at a time; None where there are none."""
     chunks = [repeat(None) if x is None else x.flatten(0, 1).split(_ARMS) for x in values]
     yield from zip(*chunks, strict=False)
-
-
-def _pull(arms: Arms, prior: Float[Tensor, "B 2 N"], guessed: Bool[Tensor, "B 2"]) -> _Pull | None:
-    """Return the pull of the elbows that are guessed from their hands; None if there are none.
-
-    The density of the elbow given the hand is that of the prior, over its mean where the hand is as deep.
-    """
-    if arms.hand_rays is None or not bool(guessed.any()):
-        return None
-    likelihood = torch.softmax(arms.log_weight[:, :, 0], -1)
-    hands = arms.directions[:, :, 0].unflatten(-1, (2, 3)).sum(-2)
-    depth = (hands @ arms.hand_rays[:, :, 0, :, None])[..., 0]
-    mean, whole = _sums_as_deep(torch.stack([likelihood * prior, likelihood], -1), depth).unbind(-1)
-    alone = torch.ones_like(prior)
-    root = torch.where(guessed[..., None], (prior * whole / mean.clamp_min(_LEAST)).sqrt(), alone)
-    return _Pull(root, likelihood[:, :, None] * torch.stack([root, alone], 2))
-
-
-def _sums_as_deep(
-    values: Float[Tensor, "B 2 N K"], depth: Float[Tensor, "B 2 N"]
-) -> Float[Tensor, "B 2 N K"]:
-    """Return the sum of values of the hypotheses that are as deep, for each hypothesis.
-
-    They are summed at even depths, with linear weights to either side.
-
-    Args:
-        values: of each hypothesis. depth: of its hand, in lengths of a bone.
-    """
-    most = math.ceil(2 / _SAME_PLACE) + 1  # two bones, and what rounding adds
-    place = depth.flatten() / _SAME_PLACE + most
-    low = place.floor()
-    farther = (place - low)[:, None]
-    count, (n_arms, size) = 2 * most + 1, (len(place) // depth.shape[-1], values.shape[-1])
-    rows = low.long() + count * torch.arange(n_arms, device=low.device).repeat_interleave(
-        depth.shape[-1]
-    )
-    flat = values.reshape(-1, size)
-    sums = flat.new_zeros(count * n_arms, size)
-    sums = sums.index_add(0, rows, (1 - farther) * flat).index_add(0, rows + 1, farther * flat)
-    return torch.lerp(sums[rows], sums[rows + 1], farther).view(values.shape)
 
 
 def _belief(
