@@ -54,8 +54,7 @@ def pull_of_elbows(
     if not bool(guessed.any()):
         return None
     likelihood = torch.softmax(log_likelihood, -1)
-    hands = directions.unflatten(-1, (2, 3)).sum(-2)
-    depth = (hands @ hand_rays[..., None])[..., 0]
+    depth = (directions @ hand_rays.repeat(1, 1, 2)[..., None])[..., 0]
     mean, whole = _sums_as_deep(torch.stack([likelihood * prior, likelihood], -1), depth).unbind(-1)
     alone = torch.ones_like(prior)
     root = torch.where(guessed[..., None], (prior * whole / mean.clamp_min(_LEAST)).sqrt(), alone)
