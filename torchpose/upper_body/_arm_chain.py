@@ -114,7 +114,7 @@ class ArmState(NamedTuple):
             hypothesis, [B, 2, N].
         seen: whether the hands are measured, [B, 2].
         pull: `ElbowPull.root`, 1 for arms without it. around: its mean about each hypothesis of the frame
-            before, [B, 2, N].
+            before, [B, 2, L].
     """
 
     directions: Tensor
@@ -296,7 +296,8 @@ class ArmChain:
             arms: the hypotheses. known: whether elbow and hand of both arms are measured.
         """
         prior = arms.log_prior[:, :, 0].exp()
-        return _belief(arms, prior, prior, known[..., 1])
+        alone = torch.ones_like(prior)
+        return _belief(arms, prior, prior, known[..., 1], alone, alone)
 
     def update(
         self,
@@ -316,15 +317,12 @@ class ArmChain:
             rays, likelihood = arms.hand_rays[:, :, 0], arms.log_weight[:, :, 0]
             pull = pull_of_elbows(directions, prior, likelihood, rays, seen & ~elbow)
         moved, around = self._moved(state.weight, state.directions, directions, seen, pull)
-        if pull is not None:
-            moved = pull.root * moved
+        root = torch.ones_like(prior) if pull is None else pull.root
+        moved = root * moved
         predicted = moved + self._anew(seen, prior) * (prior - moved)
         if again is not None:
             predicted = torch.where(again[:, None, None], prior, predicted)
-        belief = _belief(arms, prior, predicted, seen)
-        if pull is None or around is None:
-            return belief
-        return belief._replace(pull=pull.root, around=around)
+        return _belief(arms, prior, predicted, seen, root, around)
 
     def _anew(self, seen: Bool[Tensor, "B 2"], like: Tensor) -> Float[Tensor, "B 2 1"]:
         """Return the share of each arm that is reinitialised in a frame."""
@@ -381,11 +379,11 @@ class ArmChain:
         after: Float[Tensor, "B 2 M 6"],
         seen: Bool[Tensor, "B 2"],
         pull: ElbowPull | None = None,
-    ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"] | None]:
+    ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"]]:
         """Return sum_n w_n t_4(x'_m; x_n, s^2) / a_n for the directions x of two frames, and a.
 
         Args:
-            pull: that to x', for a; without it a is 1, and None.
+            pull: that to x', for a; without it a is 1.
         """
         if not bool(seen.any()):
             return self._walked(weight, before, after, self.step_unseen)
@@ -403,7 +401,7 @@ class ArmChain:
         after: Float[Tensor, "B 2 M 6"],
         step: float,
         pull: ElbowPull | None = None,
-    ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"] | None]:
+    ) -> tuple[Float[Tensor, "B 2 M"], Float[Tensor, "B 2 N"]]:
         pulls = None if pull is None else pull.weighed
         moved, means = [], []
         for share, old, new, own in _some_arms(weight[:, :, None], before, after, pulls):
@@ -413,7 +411,7 @@ class ArmChain:
                 means.append(pulled / alone)
                 share = share / means[-1]
             moved.append(torch.bmm(share, walk))
-        around = torch.cat(means).view_as(weight) if means else None
+        around = torch.cat(means).view_as(weight) if means else torch.ones_like(weight)
         return torch.cat(moved).view(*after.shape[:-1]), around
 
     @staticmethod
@@ -502,17 +500,20 @@ def _some_arms(*values: Tensor | None) -> Iterator[tuple[Any, ...]]:
 
 
 def _belief(
-    arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"], seen: Bool[Tensor, "B 2"]
+    arms: Arms,
+    prior: Float[Tensor, "B 2 N"],
+    predicted: Float[Tensor, "B 2 N"],
+    seen: Bool[Tensor, "B 2"],
+    pull: Float[Tensor, "B 2 N"],
+    around: Float[Tensor, "B 2 L"],
 ) -> ArmState:
-    """Return the posterior, without any pull."""
     log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(_LEAST).log()
     total = evidence = torch.logsumexp(log_weight, -1)
     if arms.log_told is not None:
         evidence = torch.logsumexp(log_weight - arms.log_told[:, :, 0], -1)
     weight = (log_weight - total[..., None]).exp()
-    nowhere = torch.ones_like(weight)
     directions = arms.directions[:, :, 0]
-    return ArmState(directions, weight, evidence, prior, predicted, seen, nowhere, nowhere)
+    return ArmState(directions, weight, evidence, prior, predicted, seen, pull, around)
 
 
 def _axes_of_spheres(axes: Float[Tensor, "B M 3 3"]) -> Float[Tensor, "B 2 M 3 3"]:

@@ -34,10 +34,9 @@ from torchpose.video._person_stream import (
 )
 
 LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
-_WRITTEN = (
-    32  # poses that are written together: opening the files takes longer than writing a pose;
-)
-# and parts of the measurements that are joined
+# Poses that are written together, since opening the files takes longer than writing a pose; and parts of
+# measurements that are joined.
+_WRITTEN = 32
 
 
 class PoseSpool:
