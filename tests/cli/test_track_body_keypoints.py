@@ -754,6 +754,9 @@ def test_bad_files_are_refused(track, torchpose, scene, tmp_path):
     done = track(tmp_path / "out", tmp_path / "empty", "left.mp4", "behind.mp4")
     assert (done.code, "the folder is empty" in done.err) == (2, True)
 
+    done = track(tmp_path / "out", "front_json", "left.csv", "0")
+    assert (done.code, "0 is taken for a camera" in done.err) == (2, True)
+
     wide = keypoints_of(points[:, 2], image_size=(2 * WIDTH, HEIGHT))
     write_keypoints(tmp_path / "wide.npz", wide)
     done = track(tmp_path / "out", "front_json", "left.csv", tmp_path / "wide.npz")

@@ -5,9 +5,11 @@ import pytest
 
 from tests.cli.pretended_camera import PretendedCamera, use_camera
 from torchpose import demo
+from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter, draw_overlay
+from torchpose.video._recording import PoseSpool
 
 N = 36
 DETECTOR = """
@@ -38,6 +40,13 @@ class passing(two):
 class nobody(two):
     def __call__(self, image):
         return np.zeros((0, len(NAMES), 2)), np.zeros((0, len(NAMES)))
+
+
+class failing(two):
+    def __call__(self, image):
+        if self.at == 24:
+            raise RuntimeError("the model is gone")
+        return super().__call__(image)
 
 
 class wrong(two):
@@ -120,6 +129,63 @@ def test_persons_before_a_camera_have_the_names_that_they_had_while_it_ran(
     assert "of person 2:" in done.out
     page = (folder / "out" / "report.html").read_text()
     assert page.index('"label":"person 2"') < page.index('"label":"person 1"')
+
+
+@pytest.fixture
+def camera(torchpose, files, folder, monkeypatch):
+    """The command before a camera, with the names of the results and one of the files."""
+    grey = np.full((480, 640, 3), 90, np.uint8)
+    use_camera(monkeypatch, PretendedCamera([grey] * (N + 10)))
+
+    def run(detector):
+        given = ("--prior", files / "prior.safetensors", "--pictures", "false")
+        given += ("--method", "mkf-fixed", "--detector", f"some_detectors:{detector}")
+        return torchpose("track", 0, "--out", folder / "out", *given)
+
+    return run
+
+
+def test_what_a_camera_gave_before_an_error_is_written_and_the_error_is_told(camera, folder):
+    done = camera("failing")
+    assert done.code == 2 and "RuntimeError: the model is gone" in done.err
+    assert {"poses.npz", "poses_p02.npz", "overlay.mp4", "report.html"} <= {
+        path.name for path in (folder / "out").iterdir()
+    }
+    track = PoseTrack.load(folder / "out" / "poses.npz")
+    assert track.first_frame + track.joints3d.shape[1] == 24
+    assert "an error ended the recording after 24 frames" in track.notes
+
+
+def test_a_disk_that_fills_up_before_a_camera_has_room_for_poses_without_the_overlay(
+    camera, folder, monkeypatch
+):
+    write = PoseSpool._write
+
+    def full(spool):
+        if any(folder.glob("out/.torchpose-track/*.mp4*")):
+            raise OutputError("poses cannot be kept here (No space left on device)")
+        write(spool)
+
+    monkeypatch.setattr(PoseSpool, "_write", full)
+    monkeypatch.setattr("torchpose.video._recording._WRITTEN", 20)
+    done = camera("two")
+    assert done.code == 2 and "No space left" in done.err
+    names = {path.name for path in (folder / "out").iterdir()}
+    assert {"poses.npz", "report.html"} <= names and "overlay.mp4" not in names
+    assert PoseTrack.load(folder / "out" / "poses.npz").joints3d.shape[1] == 20
+
+
+def test_tables_that_are_whole_are_kept_where_the_next_one_does_not_fit(
+    camera, folder, monkeypatch
+):
+    def full(*_):
+        raise OutputError("poses.bvh: cannot be written (No space left on device)")
+
+    monkeypatch.setattr("torchpose.upper_body._pose_files.write_bvh", full)
+    done = camera("two")
+    assert done.code == 2 and "No space left" in done.err
+    names = {path.name for path in (folder / "out").iterdir()}
+    assert names == {"poses.npz", "poses.csv", ".torchpose-track.json"}
 
 
 @pytest.mark.parametrize(

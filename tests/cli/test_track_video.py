@@ -14,6 +14,7 @@ from tests.cli.pretended_camera import PretendedCamera, use_camera
 from torchpose import demo
 from torchpose.cli._common import UntilInterrupted
 from torchpose.cli._track_output import notes_of_all
+from torchpose.cli._track_video import _stopping
 from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
@@ -237,6 +238,23 @@ def test_other_signals_end_a_recording_too_where_they_are_named():
     with UntilInterrupted(frames(), signals=(signal.SIGINT, signal.SIGTERM)) as items:
         assert list(items) == [0] and items.interrupted
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
+def test_a_terminal_that_is_closed_ends_a_camera_once_unless_that_is_ignored():
+    def frames():
+        yield 0
+        for _ in range(2):  # by the shell, and by the system
+            os.kill(os.getpid(), signal.SIGHUP)
+        yield 1
+
+    before = signal.getsignal(signal.SIGHUP)
+    assert signal.SIGHUP in _stopping()
+    with UntilInterrupted(frames(), signals=_stopping()) as items:
+        assert list(items) == [0] and items.interrupted
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    assert signal.SIGHUP not in _stopping()
+    signal.signal(signal.SIGHUP, before)
 
 
 def test_a_recording_that_was_stopped_says_so(clip, track, monkeypatch):

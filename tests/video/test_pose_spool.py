@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import torchpose.video._recording
 from torchpose.errors import InputError, OutputError
 from torchpose.upper_body import PoseTrack
 from torchpose.upper_body._outlier_notes import outlier_notes
@@ -107,3 +108,24 @@ def test_notes_of_later_blocks_are_kept_and_said_once():
     for notes in ((), ("a note",), ("another",), ("a note",)):
         spool.append(replace(poses(4), notes=notes))
     assert spool.track().notes == ("a note", "another")
+
+
+def test_poses_that_a_full_disk_did_not_take_are_written_once_there_is_room(tmp_path, monkeypatch):
+    spool, taken = PoseSpool(tmp_path), []
+
+    def full(values):
+        if len(taken) == 3:
+            raise OSError(28, "No space left on device")
+        taken.append(values)
+        return array(values)
+
+    array = torchpose.video._recording._array
+    with monkeypatch.context() as disk:
+        disk.setattr("torchpose.video._recording._array", full)
+        with pytest.raises(OutputError, match="No space left"):
+            spool.append(poses(40, 1))
+    spool.append(poses(2, 2))
+    track = spool.track()
+    for name in FIELDS:
+        whole = torch.cat([getattr(poses(*given), name) for given in ((40, 1), (2, 2))], 1)
+        assert torch.equal(getattr(track, name), whole)

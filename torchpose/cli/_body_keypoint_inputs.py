@@ -104,9 +104,16 @@ def are_keypoints(inputs: Sequence[str], detector: str | None) -> bool:
 
     Raises:
         FileFormatError: a file of data that is no keypoints.
-        InputError: an input that is not there, an empty folder beside videos or nothing else, keypoints
-            beside videos without a detector, or a detector without videos.
+        InputError: a camera, an input that is not there, an empty folder beside videos or nothing else,
+            keypoints beside videos without a detector, or a detector without videos.
     """
+    from torchpose.video._source import is_camera
+
+    for number in filter(is_camera, inputs):
+        raise InputError(
+            f"{number} is taken for a camera: expected recordings, which are read more than once; record "
+            "it to a file first"
+        )
     for path in map(Path, inputs):
         if path.suffix.lower() in OTHER_TABLES and path.exists():
             raise FileFormatError(

@@ -9,11 +9,14 @@ from typing import Any, Generic, Self, TypeVar
 
 T = TypeVar("T")
 
+HANG_UP: signal.Signals | None = getattr(signal, "SIGHUP", None)  # Windows has none
+
 
 class UntilInterrupted(Generic[T]):
     """Items of an iterable until Ctrl-C or until `stop` returns true; a second Ctrl-C interrupts as usual.
 
-    A context manager, to be used in the main thread; the items may be taken in another.
+    A context manager, to be used in the main thread; the items may be taken in another. A terminal that is
+    closed may hang up twice, by its shell and by the system: that is one request.
 
     Args:
         items: to be passed on. stop: asked before each.
@@ -48,8 +51,8 @@ class UntilInterrupted(Generic[T]):
             self.count += 1
             yield item
 
-    def _interrupt(self, *_: object) -> None:
-        if self._asked:
+    def _interrupt(self, number: int, _: object) -> None:
+        if self._asked and number != HANG_UP:
             raise KeyboardInterrupt
         self._asked = True
 

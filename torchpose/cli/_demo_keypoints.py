@@ -143,7 +143,7 @@ def demo_keypoints(
     stage = results.stage
     file = stage / "keypoints.npz"
     write_keypoints(file, clip)
-    poses = write_track(tracks["filtered"], stage)
+    poses = list(write_track(tracks["filtered"], stage))
     drawn = _draw(stage, tracks["filtered"], scores, performance, gap) if pictures else []
     at, *places = results.commit([file, *poses, *drawn])
     print(f"\nThe keypoints: {at}; the poses: {places[0]}, poses.csv")

@@ -53,7 +53,7 @@ def demo_video(
     overlay = stage / "overlay.mp4"
     with open_video(clip) as source:
         write_overlay(overlay, source, people, n_frames)
-    poses = write_people(people, stage)
+    poses = list(write_people(people, stage))
     page = _write_report(stage, people, performance, camera_text(camera))
     drawn = _draw(stage, person.track, performance, person.first_frame) if pictures else []
     at = results.commit([clip, truth_file, overlay, page, *poses, *drawn])

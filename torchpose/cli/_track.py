@@ -163,7 +163,7 @@ def track_keypoints(job: TrackingJob) -> int:
     pictures = pictures_possible(job.pictures)
     with track_results(job.out, job.files, pictures, video=False) as results:
         track = tracker.track(keypoints, prepared, show_progress())
-        written = results.commit(write_track(track, results.stage))
+        written = results.commit(list(write_track(track, results.stage)))
         if pictures:
             written += results.commit(write_pictures(track, results.stage))
     facts = {

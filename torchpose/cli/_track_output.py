@@ -2,7 +2,8 @@
 
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -66,8 +67,8 @@ def track_results(
     )
 
 
-def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
-    """Write poses.npz, .csv and, if there is a pose in them, .bvh of one sequence; return their paths.
+def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> Iterator[Path]:
+    """Write poses.npz, .csv and, if there is a pose in them, .bvh of one sequence; yield each path.
 
     Args:
         track: the track of the sequence. out: folder.
@@ -75,13 +76,16 @@ def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
     """
     from torchpose.upper_body._pose_files import write_bvh, write_pose_csv
 
-    written = [out / f"poses{suffix}.{kind}" for kind in ("npz", "csv", "bvh")]
-    track.save(written[0])
-    write_pose_csv(track, written[1])
-    if not _has_poses(track):
-        return written[:2]
-    write_bvh(track, written[2])
-    return written
+    writers: dict[str, Callable[[Path], None]] = {
+        "npz": track.save,
+        "csv": partial(write_pose_csv, track),
+    }
+    if _has_poses(track):
+        writers["bvh"] = partial(write_bvh, track)
+    for kind, write in writers.items():
+        path = out / f"poses{suffix}.{kind}"
+        write(path)
+        yield path
 
 
 def write_pictures(

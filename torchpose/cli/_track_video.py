@@ -8,11 +8,11 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchpose._core.terminal import show_progress
 from torchpose._core.wording import counted
-from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cores
+from torchpose.cli._common import HANG_UP, UntilInterrupted, pictures_possible, share_cores
 from torchpose.cli._picture_process import PictureProcess
 from torchpose.cli._track_output import (
     TrackingJob,
@@ -42,9 +42,17 @@ if TYPE_CHECKING:
     from torchpose.video._writer import VideoWriter
 
 _OVERLAY = "overlay.mp4"
-_STOPPING = (signal.SIGINT, signal.SIGTERM)  # what a camera gave is nowhere else
 _THROUGHOUT = 0.9  # share of the frames in which a face is seen that nobody doubts
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
+
+
+class _Tracked(NamedTuple):
+    """Holds everybody, the numbers of frames read and in all, and the error that ended it, if one did."""
+
+    people: "list[TrackedPerson]"
+    n_read: int
+    n_frames: int
+    failure: Exception | None = None
 
 
 def track_video(
@@ -80,15 +88,17 @@ def track_video(
             other = PictureProcess(pictures and source.reopenable and workers > 0)
             stack.enter_context(contextlib.closing(other))
             start = time.perf_counter()
-            people, n_read, n_frames = (
+            people, n_read, n_frames, failure = (
                 _track_recording(tracker, source, results.stage, workers)
                 if source.reopenable
-                else _track_camera(tracker, source, results.stage, overlay)
+                else _track_camera(tracker, source, results.stage, overlay, stack)
             )
             seconds = time.perf_counter() - start
         notes += tuple(source.notes)  # some of them are known once it is closed
         if source.reopenable and detector is None:
             notes += _note_on_turn(source, people, n_frames)
+        if failure is not None and not people:
+            raise failure
         if not people:
             return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
         notes += _note_on_facts(settings, len(people))
@@ -103,6 +113,8 @@ def track_video(
             shown = _write_report(results.stage, people, names, n_frames, facts, notes, title)
             written += results.commit(shown)
     print(_summary(people, names, written, facts, (*notes, *results.notes)))
+    if failure is not None:
+        raise failure
     return max(report_failure(person.track) for person in people)
 
 
@@ -133,8 +145,18 @@ def _write_poses(
     overlay: bool,
     other: PictureProcess,
 ) -> list[Path]:
-    """Write the poses of everybody, then what shows them: pictures, and the overlay of a recording."""
-    written = results.commit(write_people(people, results.stage))
+    """Write the poses of everybody, then what shows them: pictures, and the overlay of a recording.
+
+    Where one cannot be written, as on a full disk, those before it are kept.
+    """
+    whole: list[Path] = []
+    try:
+        whole.extend(write_people(people, results.stage))
+    except Exception:
+        if whole:
+            results.commit(whole)
+        raise
+    written = results.commit(whole)
     # without another process Python is free for the pictures for most of the time that the encoder takes
     with ThreadPoolExecutor(1) as beside:
         drawing = beside.submit(_pictures_of, people[0], results.stage, pictures, other)
@@ -201,8 +223,8 @@ def _tracker(
 
 def _track_recording(
     tracker: "VideoTracker", source: "VideoSource", out: Path, workers: int
-) -> tuple[list["TrackedPerson"], int, int]:
-    """Return everybody in a file or folder, and twice how many frames it had; Ctrl-C ends the recording."""
+) -> _Tracked:
+    """Return everybody in a file or folder; Ctrl-C ends the recording."""
     with UntilInterrupted(source) as frames:
         people = tracker(
             frames, show_progress(), n_frames=source.n_frames, folder=out, workers=workers
@@ -212,42 +234,69 @@ def _track_recording(
         source.notes.append(
             f"stopped by Ctrl-C after {frames.count}{of} frames: the rest was not tracked"
         )
-    return people, frames.count, frames.count
+    return _Tracked(people, frames.count, frames.count)
 
 
 def _track_camera(
-    tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
-) -> tuple[list["TrackedPerson"], int, int]:
-    """Return everybody before a camera, and the numbers of frames read and in all.
+    tracker: "VideoTracker",
+    source: "VideoSource",
+    out: Path,
+    overlay: bool,
+    signals: contextlib.ExitStack,
+) -> _Tracked:
+    """Return everybody before a camera until q, stop, Ctrl-C or an error; a page shows them while it runs.
 
-    A page shows them while it runs, until q, stop or Ctrl-C.
+    Args:
+        signals: until its end, when results are written, no other signal than a second Ctrl-C ends that.
     """
     from torchpose.video._live_view import LiveView
+    from torchpose.video._recording import TrackedRecording
+    from torchpose.video._video_tracker import record
     from torchpose.video._writer import VideoWriter
 
-    with contextlib.ExitStack() as stack:
-        view = stack.enter_context(LiveView())
-        print(f"live at {view.url}; q, the button on the page or Ctrl-C stop it")
-        writers = []
-        if overlay:
-            writer = VideoWriter(out / _OVERLAY, source.fps, source.size)
-            writers.append(stack.enter_context(writer))
+    recording = TrackedRecording(tracker.tracker, tracker.stream.names, tracker.gap, out)
+    failure: Exception | None = None
+    n_frames, shown, drawn = 0, None, None
+    writers: list[VideoWriter] = []
+    view = LiveView()
 
-        n_frames, shown, drawn = 0, None, None
+    def watch(image: "Image", measured: "Found", poses: "dict[int, PoseTrack]") -> None:
+        nonlocal n_frames, shown, drawn
+        n_frames += 1
+        if image is not shown:  # the frames missed before it have the same one
+            shown, drawn = image, _drawn(image, poses, -1, measured)
+            view.show(drawn)
+        if writers:
+            _record(writers, drawn)
 
-        def watch(image: "Image", measured: "Found", poses: "dict[int, PoseTrack]") -> None:
-            nonlocal n_frames, shown, drawn
-            n_frames += 1
-            if image is not shown:  # the frames missed before it have the same one
-                shown, drawn = image, _drawn(image, poses, -1, measured)
-                view.show(drawn)
-            if writers:
-                _record(writers, drawn)
+    stop = UntilInterrupted(source, lambda: view.stop_requested, _stopping())
+    frames = signals.enter_context(stop)
+    try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(view)
+            print(f"live at {view.url}; q, the button on the page or Ctrl-C stop it")
+            if overlay:
+                writer = VideoWriter(out / _OVERLAY, source.fps, source.size)
+                writers.append(stack.enter_context(writer))
+            try:
+                record(tracker, recording, frames, show_progress(), watch=watch)
+            except OutputError:
+                raise  # there is no overlay then: on a full disk that leaves room for the poses
+            except Exception as error:
+                failure = error
+    except OutputError as error:
+        failure = error
+    if failure is not None:
+        source.notes.append(f"an error ended the recording after {counted(n_frames, 'frame')}")
+    return _Tracked(recording.finish(tracker.smoother), frames.count, n_frames, failure)
 
-        stop = UntilInterrupted(source, lambda: view.stop_requested, _STOPPING)
-        frames = stack.enter_context(stop)
-        people = tracker(frames, progress=show_progress(), folder=out, watch=watch)
-    return people, frames.count, n_frames
+
+def _stopping() -> list[signal.Signals]:
+    """Return the signals that end a camera, whose frames are nowhere else: none that `nohup` ignores."""
+    ends = [signal.SIGINT, signal.SIGTERM]
+    if HANG_UP is not None and signal.getsignal(HANG_UP) is not signal.SIG_IGN:
+        ends.append(HANG_UP)
+    return ends
 
 
 def _record(writers: list["VideoWriter"], image: "Image") -> None:
@@ -333,12 +382,10 @@ def _names(people: list["TrackedPerson"], longest_first: bool) -> list[str]:
     return [_name(place if longest_first else p.number) for place, p in enumerate(people)]
 
 
-def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
-    """Write the poses of everybody and return the paths: poses, and poses_p02 and so on of the others."""
-    written = []
+def write_people(people: list["TrackedPerson"], out: Path) -> Iterator[Path]:
+    """Write the poses of everybody and yield each path: poses, and poses_p02 and so on of the others."""
     for place, person in enumerate(people, 1):
-        written += write_track(person.track, out, person_suffix(place))
-    return written
+        yield from write_track(person.track, out, person_suffix(place))
 
 
 def _note_on_facts(settings: "TrackSettings", n_people: int) -> tuple[str, ...]:

@@ -88,11 +88,15 @@ class PoseSpool:
             self._write()
 
     def _write(self) -> None:
-        """Write the frames that wait for it."""
+        """Write the frames that wait for it; after an error they wait on."""
+        if not self._waiting:
+            return
         try:
             for name in FRAME_FIELDS:
+                arrays = [_array(getattr(block, name)) for block in self._waiting]
                 with self._path(name).open("ab") as file:
-                    file.writelines(_array(getattr(block, name)).data for block in self._waiting)
+                    file.truncate(self._n_written * arrays[0][0].nbytes)  # what an error left
+                    file.writelines(array.data for array in arrays)
         except OSError as error:
             raise OutputError(
                 f"{self._folder}: poses cannot be kept here ({error.strerror or error})"
@@ -199,18 +203,25 @@ class TrackedRecording:
         folder: str | Path | None = None,
     ) -> None:
         self.tracker, self.names, self.gap, self.folder = tracker, tuple(names), gap, folder
-        self.n_frames = 0
+        self.n_frames, self._cuts = 0, tuple[int, ...]()
         self._people: dict[int, _Person] = {}
 
-    def append(self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int) -> None:
+    def append(
+        self,
+        tracked: Mapping[int, Sequence[TrackedBlock]],
+        n_frames: int,
+        cuts: tuple[int, ...] = (),
+    ) -> None:
         """Keep the poses of the next block.
 
         Args:
             tracked: the parts of the block with poses, by person. n_frames: the length of the block.
+            cuts: the frames so far that begin another scene.
 
         Raises:
             OutputError: the disk is full.
         """
+        self._cuts = cuts
         for number, parts in tracked.items():
             for part in parts:
                 self._keep(number, part)
@@ -229,29 +240,24 @@ class TrackedRecording:
             person.keep(unmeasured(absent, len(self.names), detected))
             person.poses.append(_nobody(absent, self.tracker))
         person.keep(part.measured)
-        person.poses.append(part.poses)
         seen = torch.nonzero(part.measured.seen).flatten()
         if len(seen):
             person.last_seen = place + int(seen[-1])
             person.n_seen += len(seen)
+        person.poses.append(part.poses)  # last, since the poses are kept where writing them fails
 
-    def finish(
-        self, smoother: UpperBodyTracker | None = None, cuts: Sequence[int] = ()
-    ) -> list[TrackedPerson]:
+    def finish(self, smoother: UpperBodyTracker | None = None) -> list[TrackedPerson]:
         """Return the persons who were seen for half a second or longer, the longest seen first.
 
         Args:
             smoother: the smoother of whole recordings; None keeps the filtered poses.
-            cuts: the frames that begin another scene.
         """
         least = LEAST_SECONDS * (self.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
         lasting.sort(key=lambda person: -person.n_seen)
-        return [self._finish(person, smoother, cuts) for person in lasting]
+        return [self._finish(person, smoother) for person in lasting]
 
-    def _finish(
-        self, person: _Person, smoother: UpperBodyTracker | None, cuts: Sequence[int]
-    ) -> TrackedPerson:
+    def _finish(self, person: _Person, smoother: UpperBodyTracker | None) -> TrackedPerson:
         """Return the poses until the person was last seen."""
         count = person.last_seen + 1
         measured = person.measured(count)
@@ -262,9 +268,11 @@ class TrackedRecording:
         track = (
             found.track
             if smoother is None
-            else self._smoothed(measured, smoother, [cut - person.first_frame for cut in cuts])
+            else self._smoothed(
+                measured, smoother, [cut - person.first_frame for cut in self._cuts]
+            )
         )
-        track = with_note_on_cuts(track, cuts)
+        track = with_note_on_cuts(track, self._cuts)
         return replace(found, track=replace(track, first_frame=person.first_frame))
 
     def _smoothed(

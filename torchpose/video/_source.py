@@ -48,9 +48,8 @@ def open_video(
     text, path = str(where), Path(str(where))
     if isinstance(where, int) and kind is None:
         kind = "camera"
-    digits = text.isascii() and text.isdigit()
-    if kind == "camera" or (kind is None and digits and not os.path.exists(path)):
-        if not digits:
+    if kind == "camera" or (kind is None and is_camera(text)):
+        if not _is_number(text):
             raise InputError(f"a camera is given by its number, 0 or more; got {text!r}")
         return CameraSource(int(text), fps)
     if kind == "folder" or (kind is None and os.path.isdir(path)):
@@ -60,3 +59,12 @@ def open_video(
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{text}: is a device or a pipe; a camera is given by its number")
     return FileSource(path, fps)
+
+
+def is_camera(where: str) -> bool:
+    """Return whether a text is the number of a camera, which the name of a file or folder is not."""
+    return _is_number(where) and not os.path.exists(where)
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit()

@@ -344,27 +344,9 @@ class VideoTracker(nn.Module):
             InputError: an image of another kind or another size than the camera's, or a video with another
                 rate than `fps`. OutputError: the disk is full.
         """
-        if workers not in (0, 1):
-            raise InputError(f"workers must be 0 or 1, got {workers!r}")
         recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
-        start, size = self.init(), _BLOCK if watch is None else 1
-        state = start
-        if watch is None:
-            ahead = self._seen(start, frames, n_frames, workers)
-        else:  # who watches sees a frame soon after it was taken
-            ahead = prefetch(look_ahead(self._measurer, start.measurer, self._images(frames)))
-        with (
-            closing(ahead) as seen,  # no thread reads on when the caller gets an error
-            closing(self._blocks(start, seen, size, self._measurer.heavy)) as blocks,
-            tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
-        ):
-            for state, block, tracked in blocks:
-                recording.append(tracked, len(block.found))
-                bar.update(len(block.found))
-                if watch is not None:
-                    for _ in block.found:
-                        watch(block.images[-1], block.found[-1], dict(state.poses))
-        return recording.finish(self.smoother, state.cuts)
+        record(self, recording, frames, progress, n_frames, watch, workers)
+        return recording.finish(self.smoother)
 
     if TYPE_CHECKING:  # nn.Module has Any
         __call__ = forward
@@ -445,6 +427,40 @@ class VideoTracker(nn.Module):
         poses = {n: pose for n, pose in last.items() if bool(pose.joints3d[:, -1].isfinite().all())}
         cuts = (*state.cuts, state.n_frames) if cut else state.cuts
         return VideoState(own, streams, poses, state.n_frames + len(found), cuts), tracked
+
+
+def record(
+    tracker: VideoTracker,
+    recording: TrackedRecording,
+    frames: Iterable[Any] | Tensor,
+    progress: bool = False,
+    n_frames: int | None = None,
+    watch: Watcher | None = None,
+    workers: int = 0,
+) -> None:
+    """Track all frames into a recording, which holds the poses of those before an error too.
+
+    Args:
+        tracker: tracks them. recording: without poses yet. frames and others: of `VideoTracker.forward`.
+    """
+    if workers not in (0, 1):
+        raise InputError(f"workers must be 0 or 1, got {workers!r}")
+    start, size = tracker.init(), _BLOCK if watch is None else 1
+    if watch is None:
+        ahead = tracker._seen(start, frames, n_frames, workers)
+    else:  # who watches sees a frame soon after it was taken
+        ahead = prefetch(look_ahead(tracker._measurer, start.measurer, tracker._images(frames)))
+    with (
+        closing(ahead) as seen,  # no thread reads on when the caller gets an error
+        closing(tracker._blocks(start, seen, size, tracker._measurer.heavy)) as blocks,
+        tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
+    ):
+        for state, block, tracked in blocks:
+            recording.append(tracked, len(block.found), state.cuts)
+            bar.update(len(block.found))
+            if watch is not None:
+                for _ in block.found:
+                    watch(block.images[-1], block.found[-1], dict(state.poses))
 
 
 def _keypoint_measurer(
