@@ -4,6 +4,7 @@ import math
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
@@ -42,6 +43,7 @@ from torchpose.upper_body._estimator_table import BONES, method_options
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._tracker_options import MethodOptions, TrackerOptions
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
+from torchpose.video._live_rate import LiveRate
 from torchpose.video._measurers import (
     Found,
     MeasuredBlock,
@@ -80,6 +82,7 @@ class VideoState(NamedTuple):
         poses: the last poses of the persons in `streams`, without those of filters that degenerated.
         n_frames: the number of frames so far. cuts: those of them that begin another scene.
         size: (width, height) of these frames; None before the first.
+        rate: what the times of the last frames tell, where they have some.
     """
 
     measurer: MeasurerState | KeypointState
@@ -88,6 +91,12 @@ class VideoState(NamedTuple):
     n_frames: int = 0
     cuts: tuple[int, ...] = ()
     size: tuple[int, int] | None = None
+    rate: LiveRate = LiveRate()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what is wrong with the frames: they come at another rate than that of the tracker."""
+        return (self.rate.note,) if self.rate.note else ()
 
 
 class LivePerson(NamedTuple):
@@ -96,7 +105,8 @@ class LivePerson(NamedTuple):
     Attributes:
         number: the number of the person, in the order of appearance.
         pose: a track of one frame; `pose.failed` [1] says whether the filter degenerated, as in a
-            `PoseTrack` and a `LivePose`. `pose.notes` name the frames that begin another scene.
+            `PoseTrack` and a `LivePose`. `pose.notes` name the frames that begin another scene, and say
+            what `VideoState.notes` do.
         measured: the measurements in the frame.
     """
 
@@ -256,7 +266,8 @@ class VideoTracker(nn.Module):
         Args:
             state: the state from `init` or the step before. image: the frame, RGB, uint8, an array
                 [H, W, 3] or a tensor [3, H, W]; or a `VideoFrame` of a camera, which counts the frames that
-                were missed before it. They take the time of frames in which nothing was measured.
+                were missed before it. They take the time of frames in which nothing was measured. The
+                times of thirty frames at another rate than `fps` are in `VideoState.notes`.
 
         Returns:
             The next state, and the persons seen within the last `max_gap`.
@@ -266,11 +277,13 @@ class VideoTracker(nn.Module):
             tracker that smooths, or what is no state of it.
         """
         state, tracked = self.advance(state, [image])
-        last = {number: tracked[number][-1].last() for number in state.streams}
-        return state, [
-            LivePerson(n, with_note_on_cuts(part.poses, state.cuts), part.measured)
-            for n, part in last.items()
-        ]
+        people = []
+        for number in state.streams:
+            _, poses, measured = tracked[number][-1].last()
+            poses = with_note_on_cuts(poses, state.cuts)
+            poses = replace(poses, notes=(*poses.notes, *state.notes))
+            people.append(LivePerson(number, poses, measured))
+        return state, people
 
     @uncompiled
     def advance(
@@ -296,12 +309,13 @@ class VideoTracker(nn.Module):
                 f"state must be a VideoState, got {type(state).__name__}; begin with init, and pass on what "
                 "the step before returned"
             )
-        size = state.size
+        size, rate = state.size, state.rate
 
         def sized() -> Iterator[tuple[Image, int]]:
-            nonlocal size
-            for image, missed in self._images(images, state.size):
+            nonlocal size, rate
+            for image, missed, time in self._timed(images, state.size):
                 size = image.shape[1], image.shape[0]
+                rate = rate.after(time, missed, self.fps)
                 yield image, missed
 
         seen = look_ahead(self._measurer, state.measurer, sized())
@@ -312,7 +326,7 @@ class VideoTracker(nn.Module):
                 placed = (part._replace(start=place + part.start) for part in parts)
                 tracked.setdefault(number, []).extend(placed)
             place, last = place + len(block.found), after
-        return last._replace(size=size), tracked
+        return last._replace(size=size, rate=rate), tracked
 
     @uncompiled
     def forward(
@@ -351,10 +365,15 @@ class VideoTracker(nn.Module):
     if TYPE_CHECKING:  # nn.Module has Any
         __call__ = forward
 
-    def _images(
+    def _images(self, frames: Iterable[Any] | Tensor) -> Iterator[tuple[Image, int]]:
+        """Return images, and how many frames were missed before each, once their rate is known."""
+        timed = self._timed(frames)
+        return ((image, missed) for image, missed, _ in timed)
+
+    def _timed(
         self, frames: Iterable[Any] | Tensor, size: tuple[int, int] | None = None
-    ) -> Iterator[tuple[Image, int]]:
-        """Return images, and how many frames were missed before each, once their rate is known.
+    ) -> Iterator[tuple[Image, int, Any]]:
+        """Return images, how many frames were missed before each, and times, once their rate is known.
 
         Args:
             frames: see `forward`. size: (width, height) of the frames before, None if there are none.
@@ -514,8 +533,8 @@ def _images_of_size(
     frames: Iterable[Any] | Tensor,
     of_camera: tuple[int, int] | None,
     before: tuple[int, int] | None,
-) -> Iterator[tuple[Image, int]]:
-    """Yield the images of frames with the numbers missed, all of the size of the camera, or of the first.
+) -> Iterator[tuple[Image, int, Any]]:
+    """Yield images of frames, the numbers missed and times, all of the size of the camera, or of the first.
 
     Args:
         frames: with images. of_camera: (width, height) of its images, if it is known.
@@ -535,7 +554,7 @@ def _images_of_size(
         missed = getattr(frame, "missed", 0)
         if not isinstance(missed, Integral) or missed < 0:
             raise InputError(f"missed must be a whole number of frames, 0 or more, got {missed!r}")
-        yield image, int(missed)
+        yield image, int(missed), getattr(frame, "time", None)
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
