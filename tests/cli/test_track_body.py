@@ -439,24 +439,47 @@ def test_joints_beside_the_image_are_not_folded_into_it(distortions):
     assert (u[:there].diff() > 0).all()
 
 
+class Films:
+    """Black videos of ten frames."""
+
+    fps, read = 30.0, 0
+
+    def __init__(self, *names):
+        self.names, self.sizes = list(names), [(480, 320)] * len(names)
+
+    def images(self):
+        for _ in range(10):
+            self.read += 1
+            yield tuple(np.zeros((320, 480, 3), np.uint8) for _ in self.names)
+
+    def drawn(self, people, t, images):
+        return list(images)
+
+
+class Poses:
+    """Those of frames 2, 3 and 4."""
+
+    first_frame = 2
+
+    def __len__(self):
+        return 3
+
+
 def test_videos_are_not_read_past_the_last_pose(tmp_path):
-    class Films:
-        names, sizes, fps, read = ["a"], [(16, 16)], 30.0, 0
-
-        def images(self):
-            for _ in range(10):
-                self.read += 1
-                yield (np.zeros((16, 16, 3), np.uint8),)
-
-        def drawn(self, people, t, images):
-            return list(images)
-
-    class Poses:
-        first_frame = 2
-
-        def __len__(self):
-            return 3
-
-    films = Films()
+    films = Films("a")
     assert draw(films, [Poses()], tmp_path, videos=False, picture=True)
     assert films.read == 6
+
+
+def test_the_picture_of_several_cameras_names_them(tmp_path):
+    def parts(*names):
+        (path,), _ = draw(Films(*names), [Poses()], tmp_path, videos=False, picture=True)
+        picture = cv2.imread(str(path))
+        assert not picture[:, 480:].any(), "once for each camera"
+        return picture[:320], picture[324:]
+
+    first, second = parts("front", "left wall")
+    assert first[:40].any() and second[:40].any() and not first[40:].any()
+    ink = [int(np.flatnonzero(part.any((0, 2)))[-1]) for part in (first, second)]
+    assert ink[0] < ink[1], "a longer name is wider"
+    assert not parts("front")[0].any(), "one camera needs no name"

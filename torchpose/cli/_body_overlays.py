@@ -101,7 +101,7 @@ def draw(
                 strip.append(drawn)
     files = [file for file, count in zip(files, counts, strict=False) if count > first]
     if picture and strip:
-        files.append(_write_strip(out / "overlay.png", strip, films.sizes))
+        files.append(_write_strip(out / "overlay.png", strip, films))
     return files, tuple(
         f"the video of camera {name} ends after {counted(count, 'frame')}, so its overlay does not show the "
         "poses after that"
@@ -110,12 +110,13 @@ def draw(
     )
 
 
-def _write_strip(path: Path, strip: list[list[Any]], sizes: Sequence[tuple[int, int]]) -> Path:
-    """Write frames as columns and cameras, of images of these sizes, as rows; black where there is none."""
+def _write_strip(path: Path, strip: list[list[Any]], films: DrawnVideos) -> Path:
+    """Write frames as columns and cameras as rows with their names; black where there is no image."""
     import cv2
     import numpy as np
 
     from torchpose._core.files import atomic_path
+    from torchpose.video._overlay import named
 
     height = 320
 
@@ -123,11 +124,11 @@ def _write_strip(path: Path, strip: list[list[Any]], sizes: Sequence[tuple[int, 
         width = max(1, round(image.shape[1] * height / image.shape[0]))
         return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
-    black = [np.zeros((rows, columns, 3), np.uint8) for columns, rows in sizes]
-    rows = [
-        np.hstack([small(blank if frame[c] is None else frame[c]) for frame in strip])
-        for c, blank in enumerate(black)
-    ]
+    black = [np.zeros((rows, columns, 3), np.uint8) for columns, rows in films.sizes]
+    rows = []
+    for c, (name, blank) in enumerate(zip(films.names, black, strict=True)):
+        first, *others = [small(blank if frame[c] is None else frame[c]) for frame in strip]
+        rows.append(np.hstack([named(first, name) if len(black) > 1 else first, *others]))
     widest = max(row.shape[1] for row in rows)
     rows = [np.pad(row, ((0, 4), (0, widest - row.shape[1]), (0, 0))) for row in rows]
     with atomic_path(path) as temporary:

@@ -347,6 +347,13 @@ def draw_body(
     return canvas
 
 
+def named(image: Image, name: str) -> Image:
+    """Return a copy of an image with a name in its upper left corner, of which cv2 has the ASCII letters."""
+    canvas = np.array(image, order="C")
+    Pen(canvas).label(name, [[0.0, 0.0]], 0, _MIDDLE)
+    return canvas
+
+
 def _enlarged(canvas: Image, mask: Tensor) -> NDArray[np.uint8]:
     import cv2
 
