@@ -189,7 +189,7 @@ def test_swapped_legs_take_their_covariances_along():
 def test_hypotheses_that_all_die_are_spread_anew():
     _, _, truth, silhouettes = scene()
     elsewhere = torch.zeros_like(silhouettes[:1])
-    elsewhere[..., :2, :2] = True  # a corner, far from every part
+    elsewhere[..., :8, :8] = True  # a corner, far from every part
     filter_ = tracker(10, weighting="parts")
     with pytest.warns(DegenerateFilterWarning, match="all particles died"):
         after, out = filter_.step(filter_.init(truth[:1]), elsewhere, rig(), generator=seeded(0))

@@ -19,6 +19,7 @@ from torchpose.whole_body import (
     motion_std,
     render,
 )
+from torchpose.whole_body._filters.body_frames import without_specks
 from torchpose.whole_body._sharpness import ValidationSequence, mean_joint_error
 
 BODY, RIG = walker(), rig()
@@ -82,6 +83,31 @@ def test_empty_silhouettes_let_the_filter_coast(kind, sequence, process_cov, man
     spread = out.std[0, :, :3].norm(dim=-1)
     assert spread[9] > spread[6] > 1.2 * spread[3] and spread[11] < spread[9]
     assert out.mean.isfinite().all()
+
+
+def test_specks_are_nobody(sequence, process_cov):
+    """The topmost rows of the person who has left; more of them are the person."""
+    start, _, silhouettes = sequence
+    tops = silhouettes[:8].any(-1).cumsum(-1)[..., None]
+    shown = [silhouettes[:8] & (tops <= rows) for rows in (0, 1, 12)]
+    given = torch.stack([torch.cat([silhouettes[:4], part[4:]]) for part in shown])
+    tracker = SIRParticleFilter(BODY, 100, process_cov=process_cov, sharpness=60.0)
+    out = tracker(given, RIG, start, generator=[generator() for _ in range(3)])
+    assert given[1, 4:].flatten(2).any(-1).all()
+    assert out.coasting[:2, 4:].all() and not out.coasting[2].any()
+    assert torch.equal(out.mean[0], out.mean[1]) and not torch.equal(out.mean[0], out.mean[2])
+
+
+def test_specks_where_the_body_is_expected_beside_the_image_are_a_share_of_that():
+    beside = walk(BODY, 1).clone()
+    beside[:, :3] += 100.0
+    some = torch.zeros(1, len(RIG), HEIGHT, WIDTH, dtype=torch.bool)
+    few = some.clone()
+    few[..., : round(0.001 * HEIGHT * WIDTH)][..., 0, :] = True
+    some[..., 0, :] = True
+    for silhouettes, seen in ((few, False), (some, True)):
+        found = without_specks(BODY, beside, silhouettes, RIG)
+        assert bool(found.area.all()) == bool(found.area.any()) == seen
 
 
 def test_overlap_limits_and_single_precision(sequence, process_cov):

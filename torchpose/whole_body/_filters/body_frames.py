@@ -24,6 +24,10 @@ from torchpose.whole_body._silhouettes.rendering import (
 Score = Callable[[Tensor], Tensor]
 Likelihood = Callable[[Tensor, Tensor], Tensor]
 
+# Shares below which a silhouette is specks: of the area in which the body is expected there (specks that an
+# empty scene leaves had up to 7 %, persons 70 % and more), and of the image if it is expected beside that.
+_OF_BODY, _OF_IMAGE = 0.1, 0.002
+
 
 class Frame(NamedTuple):
     """Holds the observation of one frame, and the score of states under it.
@@ -69,6 +73,7 @@ def silhouette_score(
 
 def see_frame(
     body: Any,
+    expected: Tensor,
     observed: Tensor,
     cameras: Any,
     likelihood: str | Likelihood,
@@ -78,14 +83,16 @@ def see_frame(
     """Return the frame of some observations, with the exponent of the likelihood.
 
     Args:
+        expected: the states [B, D] of which silhouettes are expected.
         observed: silhouettes [B, C, H, W], or what a callable takes. cameras: the C cameras.
         likelihood, sharpness, limb_shape: as `SilhouetteParticleFilter`.
     """
-    seen = is_seen(observed)
     if callable(likelihood):
+        seen = is_seen(observed)
         raw: Score = lambda states: likelihood(states, observed)  # noqa: E731
         return Frame(_sharpened(raw, sharpness, seen), seen, observed, cameras)
-    prepared = prepare_silhouettes(observed)
+    prepared = without_specks(body, expected, observed, cameras, limb_shape)
+    seen = prepared.area.any(-1)
     raw = silhouette_score(body, prepared, cameras, likelihood, limb_shape)
     return Frame(_sharpened(raw, sharpness, seen), seen, prepared, cameras)
 
@@ -129,6 +136,26 @@ def _sharpened(raw: Score, sharpness: float, seen: Bool[Tensor, " B"]) -> Score:
         return torch.where(seen[:, None], value, 0.0)
 
     return score
+
+
+def without_specks(
+    body: Any, expected: Tensor, silhouettes: Tensor, cameras: Any, limb_shape: str = "cylinders"
+) -> PreparedSilhouettes:
+    """Return silhouettes [B, C, H, W], those empty that are too small for the body that is expected.
+
+    Args:
+        expected: its states [B, D]. cameras: the C cameras. limb_shape: "cylinders" or "rectangles".
+    """
+    prepared = prepare_silhouettes(silhouettes)
+    if not bool(prepared.area.any()):
+        return prepared
+    shown = count_pixels(body, expected[:, None], cameras, prepared, limb_shape=limb_shape).model
+    anywhere = _OF_IMAGE * silhouettes[0, 0].numel()
+    least = torch.where(shown > 0, _OF_BODY * shown, anywhere)[:, 0].to(prepared.area.device)
+    specks = (prepared.area > 0) & (prepared.area < least)
+    if not bool(specks.any()):
+        return prepared
+    return prepare_silhouettes(silhouettes & ~specks[..., None, None])
 
 
 def is_seen(observed: Tensor) -> Bool[Tensor, " B"]:

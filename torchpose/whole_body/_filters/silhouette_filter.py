@@ -330,7 +330,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         Returns:
             The next state, and the `BodyFilterOutput` of the frame, [B, ...].
         """
-        frame = with_keypoints(self.body, self._outlined(silhouettes, cameras), keypoints)
+        frame = with_keypoints(self.body, self._outlined(state, silhouettes, cameras), keypoints)
         moved = self.move(self._resample(state, generator), frame, generator)
         dead = ~torch.isfinite(moved.log_weights.amax(-1))
         lost = torch.where(dead, state.lost + 1, 0)
@@ -418,12 +418,14 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         if (state.trend is None) != (self.first_trend(state.mean) is None):
             raise InputError("state is of another kind of filter; begin with init")
 
-    def _outlined(self, silhouettes: Tensor | None, cameras: Any) -> Frame | None:
+    def _outlined(
+        self, state: BodyFilterState, silhouettes: Tensor | None, cameras: Any
+    ) -> Frame | None:
         """Return the frame of silhouettes, if there are any."""
         if silhouettes is None:
             return None
         return see_frame(
-            self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
+            self.body, state.mean, silhouettes.to(self.step_std.device), cameras, self.likelihood,
             self.sharpness, self.limb_shape,
         )  # fmt: skip
 
