@@ -55,6 +55,20 @@ def test_after_too_long_nobody_is_expected_back():
     assert numbers == [[0], [1]]
 
 
+def test_who_left_too_long_ago_is_forgotten_and_numbers_go_on():
+    """As before a public camera: one who stays, and others who pass by in five kinds of clothes."""
+    kinds = [RED, GREEN, (250, 250, 250), (0, 0, 0), (250, 250, 0)]
+    register, numbers = PersonRegister(within=30), []
+    state = register.init()
+    for who in range(60):
+        image, faces = scene((400, BLUE), (100, kinds[who % 5]))
+        identity = torch.tensor([0, who + 1])
+        state, number = register.step(state, image, faces, identity, 10 * who)
+        numbers.append(number.tolist())
+    assert numbers == [[0, who + 1] for who in range(60)]
+    assert len(state.number) == len(state.colours) <= 5
+
+
 def test_somebody_who_is_still_there_is_not_mistaken_for_one_who_left():
     numbers = follow(PersonRegister(), [(0, [(0, 100, RED)]), (1, [(0, 100, RED), (1, 400, RED)])])
     assert numbers == [[0], [0, 1]]

@@ -19,16 +19,23 @@ _CLEARLY = 1.2  # times as large as somebody who is followed, from which another
 
 
 class Persons(NamedTuple):
-    """Holds the P persons seen so far.
+    """Holds the P persons who may come back, in the order of their numbers.
 
     Attributes:
-        face: identity of the face that each had last [P]. colours: of their clothes [P, 512].
-        last_seen: frame [P].
+        number: of each [P]. face: identity of the face that each had last [P].
+        colours: of their clothes [P, 512]. last_seen: frame [P].
+        n_ever: how many persons there were, those who cannot be recognised any more included.
     """
 
+    number: Int[Tensor, " P"]
     face: Int[Tensor, " P"]
     colours: Float[Tensor, "P 512"]
     last_seen: Int[Tensor, " P"]
+    n_ever: int
+
+    def face_of(self, number: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+        """Return the identity of the face that each of these persons had last."""
+        return self.face[match_rows(self.number, number)]
 
 
 def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
@@ -143,7 +150,8 @@ class PersonRegister(nn.Module):
     def init(self) -> Persons:
         """Return the state without persons."""
         nobody = torch.zeros(0, dtype=torch.long)
-        return Persons(nobody, torch.zeros(0, _BINS**3, dtype=torch.float64), nobody.clone())
+        colours = torch.zeros(0, _BINS**3, dtype=torch.float64)
+        return Persons(nobody, nobody.clone(), colours, nobody.clone(), 0)
 
     def recognises(
         self,
@@ -179,7 +187,7 @@ class PersonRegister(nn.Module):
         """Return the next state, and the number of the person of each face.
 
         A newcomer may be a person in the same clothes whose face is lost. Then two faces have that number,
-        and the newcomer's is the one in `Persons.face`.
+        and the newcomer's is the one in `Persons.face`. Who cannot be recognised any more is forgotten.
 
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the tracked faces. frame: number.
@@ -187,6 +195,7 @@ class PersonRegister(nn.Module):
                 clothes below it are not learnt. None means all are detected.
             lost: True where a face may be found elsewhere, as that of a newcomer. None means nowhere.
         """
+        persons = self._without_long_gone(persons, identity, frame)
         colours = clothes_colours(image, faces)
         owner = match_rows(persons.face, identity)
         owner = torch.where(owner < len(persons.face), owner, -1)
@@ -198,21 +207,38 @@ class PersonRegister(nn.Module):
         known[owner] += rate * (colours - known[owner])
         last_seen = persons.last_seen.clone()
         last_seen[owner] = frame
-        return persons._replace(colours=known, last_seen=last_seen), owner
+        return persons._replace(colours=known, last_seen=last_seen), persons.number[owner]
+
+    def _without_long_gone(self, persons: Persons, identity: Tensor, frame: int) -> Persons:
+        """Return the state without persons who left too long ago to be recognised."""
+        gone = frame - persons.last_seen > self.within
+        if not bool(gone.any()):
+            return persons
+        kept = ~gone | torch.isin(persons.face, identity)
+        number, face, colours, last_seen, n_ever = persons
+        return Persons(number[kept], face[kept], colours[kept], last_seen[kept], n_ever)
 
     def _admit(
         self, persons: Persons, colours: Tensor, identity: Tensor, followed: Tensor, frame: int
     ) -> tuple[Persons, int]:
-        """Return the next state and the number of a newcomer, who is none of those `followed` already."""
+        """Return the next state and the row of a newcomer, who is none of those `followed` already.
+
+        Args:
+            colours: of the newcomer's clothes. identity: of the face. followed: rows of persons.
+        """
         alike = (persons.colours * colours).sqrt().sum(1)
         away = frame - persons.last_seen <= self.within
         away[followed] = False
         alike = torch.where(away & (alike >= self.likeness), alike, -torch.ones_like(alike))
         if len(alike) and float(alike.max()) > 0:
-            number = int(alike.argmax())
+            row = int(alike.argmax())
             face = persons.face.clone()
-            face[number] = identity
-            return persons._replace(face=face), number
-        face = torch.cat([persons.face, identity[None]])
-        last_seen = torch.cat([persons.last_seen, persons.last_seen.new_tensor([frame])])
-        return Persons(face, torch.cat([persons.colours, colours[None]]), last_seen), len(face) - 1
+            face[row] = identity
+            return persons._replace(face=face), row
+        number, face, known, last_seen, n_ever = persons
+        joined = Persons(
+            torch.cat([number, number.new_tensor([n_ever])]), torch.cat([face, identity[None]]),
+            torch.cat([known, colours[None]]), torch.cat([last_seen, last_seen.new_tensor([frame])]),
+            n_ever + 1,
+        )  # fmt: skip
+        return joined, len(face)

@@ -225,7 +225,7 @@ class UpperBodyMeasurer(CpuModule):
         persons, number = self.register.step(
             seen.persons, image, faces, identity, seen.frame, detected, ~detected
         )
-        own = persons.face[number] == identity  # else who had the face is found elsewhere
+        own = persons.face_of(number) == identity  # else who had the face is found elsewhere
         faces, face_cov, number = faces[own], face_cov[own], number[own]
         if self.max_persons is not None:
             rows = largest_persons(number, faces[:, 2], seen.followed, self.max_persons)
