@@ -28,9 +28,6 @@ from torchpose.whole_body import count_pixels
 from torchpose.whole_body._silhouettes.outlines import (
     NEAR,
     ProjectedLimbs,
-    Strip,
-    _row_ends,
-    limb_intervals,
     outline,
     project_limbs,
 )
@@ -40,6 +37,7 @@ from torchpose.whole_body._silhouettes.rendering import (
     prepare_silhouettes,
     render_limbs,
 )
+from torchpose.whole_body._silhouettes.row_intervals import Strip, _row_ends, limb_intervals
 
 SIZES = ((120, 160), (480, 640))
 PARTICLES, CAMERAS = 500, 3

@@ -102,7 +102,7 @@ _MODULES = {
     ),
     "whole_body._silhouettes": (
         "body.limb_batches body.limb_counts body.limb_outlines=outlines body.rectangles=outlines "
-        "body.row_intervals=outlines body.shape body.silhouette=rendering "
+        "body.row_intervals body.shape body.silhouette=rendering "
         "body.silhouette_likelihood=likelihood"
     ),
 }

@@ -189,7 +189,9 @@ def test_threads_change_nothing(threads):
 
 
 def test_without_numpy_as_on_other_devices(monkeypatch):
-    monkeypatch.setattr("torchpose.whole_body._silhouettes.outlines._by_numpy", lambda x: False)
+    monkeypatch.setattr(
+        "torchpose.whole_body._silhouettes.row_intervals._by_numpy", lambda x: False
+    )
     limbs, rig = random_limbs(7, seed=11), make_rig(3)
     assert torch.equal(
         render_limbs(limbs, rig, HEIGHT, WIDTH), slow_render(limbs, rig, HEIGHT, WIDTH)

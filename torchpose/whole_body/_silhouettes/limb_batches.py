@@ -13,13 +13,8 @@ from torch.nn.functional import pad
 from torchpose.body._limbs import Limbs, check_limbs
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import InputError
-from torchpose.whole_body._silhouettes.outlines import (
-    LIMB_SHAPES,
-    RowIntervals,
-    Strip,
-    limb_intervals,
-    project_limbs,
-)
+from torchpose.whole_body._silhouettes.outlines import LIMB_SHAPES, project_limbs
+from torchpose.whole_body._silhouettes.row_intervals import RowIntervals, Strip, limb_intervals
 
 # Intervals in one chunk: with fewer the overhead of calls shows, with more only the memory grows.
 _INTERVALS, _INTERVALS_GPU = 2**17, 2**22

@@ -19,8 +19,9 @@ from torchpose.whole_body._silhouettes.limb_batches import (
     intervals_of,
     which_silhouette,
 )
-from torchpose.whole_body._silhouettes.outlines import NEAR, RowIntervals, Strip
+from torchpose.whole_body._silhouettes.outlines import NEAR
 from torchpose.whole_body._silhouettes.rendering import PreparedSilhouettes, prepare_silhouettes
+from torchpose.whole_body._silhouettes.row_intervals import RowIntervals, Strip
 
 
 class PartCounts(NamedTuple):

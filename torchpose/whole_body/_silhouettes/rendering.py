@@ -24,7 +24,8 @@ from torchpose.whole_body._silhouettes.limb_batches import (
     intervals_of,
     which_silhouette,
 )
-from torchpose.whole_body._silhouettes.outlines import NEAR, RowIntervals, Strip, check_limb_shape
+from torchpose.whole_body._silhouettes.outlines import NEAR, check_limb_shape
+from torchpose.whole_body._silhouettes.row_intervals import RowIntervals, Strip
 
 _PIXELS = 2**22  # rendered in one chunk
 
