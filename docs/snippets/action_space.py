@@ -5,6 +5,7 @@ import torch
 from torchpose.body import BODY_15, Body, body_joints
 from torchpose.learning import fit_action_space, repetition_axis, split_repetitions
 from torchpose.priors import ActionBank, posture_angles, posture_to_state
+from torchpose.viz import plot_action_space, save_figure
 
 
 def somebody(
@@ -30,6 +31,7 @@ for name, action in (("bend", bend), ("raise arms", raise_arms)):
     axis = repetition_axis(postures)
     performances = [p[part] for p in postures for part in split_repetitions(p, 30.0, axis)]
     spaces.append(fit_action_space(performances, 3, name=name, fps=30.0))
+    save_figure(plot_action_space(spaces[-1]), f"{name}.png")
 
 # the gate: is a posture one of the action, and the nearest one that is
 space, generator = spaces[0], torch.Generator().manual_seed(0)

@@ -46,7 +46,7 @@ def fit_action_space(
         info: more facts; name, fps and what the fit finds are filled in.
 
     Returns:
-        `ActionSpace` with D dimensions and K postures, degrees.
+        `ActionSpace` with D dimensions and K postures, degrees, and its performances in step.
 
     Raises:
         InputError: one performance only, one with too few frames, NaN, D or fps not positive,
@@ -99,7 +99,9 @@ def fit_synchronised(
         known, name=name, fps=fps, performances=len(parts), key_frames=found.key_frames,
         explained=float(variances[:d].sum() / variances.sum()),
     )  # fmt: skip
-    return ActionSpace(**tensors, info=facts), found
+    space = ActionSpace(**tensors, info=facts)
+    space.synchronised = found
+    return space, found
 
 
 def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:

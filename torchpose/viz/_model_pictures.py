@@ -253,7 +253,7 @@ _MOST_LINES = 60
 
 def plot_action_space(
     space: ActionSpace,
-    synchronised: Synchronised,
+    synchronised: Synchronised | None = None,
     n_dimensions: int = 4,
     deviations: float = 3.0,
     title: str | None = None,
@@ -264,8 +264,8 @@ def plot_action_space(
     either side of it; upright lines stand at the key frames.
 
     Args:
-        space: the fitted action. synchronised: its performances in step, which
-            `torchpose.learning.fit_actions` has beside it, in ``spaces[action]`` of its result.
+        space: the fitted action, from `torchpose.learning.fit_action_space`.
+        synchronised: other performances in step; by default those that the space was fitted to.
         n_dimensions: that are shown, as many as there are at most. deviations: of the dashed lines.
         title: above the picture; by default the action's name and size.
 
@@ -273,20 +273,25 @@ def plot_action_space(
         matplotlib `Figure`, a panel for each dimension.
 
     Raises:
-        InputError: no action space, no synchronised performances, or no dimension is asked for.
-            ShapeError: performances of another action space.
+        InputError: no action space, one from a file, which has no performances, or no dimension is asked
+            for. ShapeError: performances of another action space.
 
     Reference: Rius, Varona, Roca & Gonzalez, 2006, Figure 1.
     """
     check_count("n_dimensions", n_dimensions)
     for name, value, kind in (
-        ("space", space, ActionSpace), ("synchronised", synchronised, Synchronised)
+        ("space", space, ActionSpace), ("synchronised", synchronised, Synchronised | None)
     ):  # fmt: skip
         if not isinstance(value, kind):
             raise InputError(
-                f"{name} must be of {kind.__name__}, from torchpose.learning.fit_actions, got "
-                f"{type(value).__name__}"
+                f"{name} must be from torchpose.learning.fit_action_space, got {type(value).__name__}"
             )
+    synchronised = space.synchronised if synchronised is None else synchronised
+    if synchronised is None:
+        raise InputError(
+            "an action space from a file has no performances to draw; draw it where it is fitted, or by "
+            "torchpose fit actions"
+        )
     if synchronised.after.shape[1:] != space.performance.shape:
         raise ShapeError(
             f"the performances have {list(synchronised.after.shape[1:])} postures and dimensions, the "

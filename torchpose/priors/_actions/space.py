@@ -14,7 +14,7 @@ from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
 from torchpose.errors import InputError, PriorError
-from torchpose.priors._actions.action_file import SPACE_FILE, ActionInfo
+from torchpose.priors._actions.action_file import SPACE_FILE, ActionInfo, Synchronised
 from torchpose.priors._actions.gate import (
     CLAMP_ROUNDS,
     GATE_WIDTH,
@@ -48,6 +48,10 @@ class ActionSpace(NoHalfModule):
         variances: the variances of the training postures along each axis, [D]. lost_variance: of all other
             directions together; degrees^2.
         info: facts about the fit.
+
+    Attributes:
+        synchronised: the performances in step, which `torchpose.viz.plot_action_space` draws; None where the
+            space was loaded from a file, which does not hold them.
 
     Buffers: the seven tensors.
 
@@ -90,6 +94,7 @@ class ActionSpace(NoHalfModule):
     ) -> None:
         super().__init__()
         self.info = info or ActionInfo()
+        self.synchronised: Synchronised | None = None
         check_limbs(self.info.limbs)
         check_shape("basis", basis, [POSTURE_DIM, None])
         d = basis.shape[1]
@@ -153,11 +158,17 @@ class ActionSpace(NoHalfModule):
         d = n_dimensions
         total = self.variances.sum() + self.lost_variance
         kept = self.variances[:d].sum()
-        return ActionSpace(
+        first = ActionSpace(
             self.mean, self.basis[:, :d].contiguous(), self.performance[:, :d].contiguous(),
             self.std[:, :d].contiguous(), self.match_std[:d], self.variances[:d], total - kept,
             replace(self.info, explained=float(kept / total)),
         )  # fmt: skip
+        if self.synchronised is not None:
+            before, after = self.synchronised.before, self.synchronised.after
+            first.synchronised = self.synchronised._replace(
+                before=before[..., :d], after=after[..., :d]
+            )
+        return first
 
     # --- postures and the subspace ----------------------------------------------------------------
 
