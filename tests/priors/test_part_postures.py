@@ -35,6 +35,23 @@ def test_angles_are_those_of_the_joints(body):
     assert single.dtype == torch.float32 and (single - expected).abs().max() < 0.1
 
 
+def test_gradients_are_finite_at_right_angles_and_half_turns():
+    """Where those of arcsin and of the quaternion's scalar part are infinite they are 0, as of joints."""
+    body = Body.of_height(BODY_15, 1.75)
+    states = torch.zeros(3, 36, dtype=torch.float64)  # at rest legs hang at right angles
+    states[1, 6:9] = torch.tensor([0.0, 1.0, 0.0])
+    states[2] = 0.1 * torch.randn(36, generator=torch.Generator().manual_seed(0)).double()
+    slopes = []
+    for postures in (PartPostures(body, torch.float64), lambda x: posture_angles(body.joints(x))):
+        given = states.clone().requires_grad_()
+        angles = postures(given)
+        assert angles[0].abs().max() == 90
+        (slope,) = torch.autograd.grad(angles.sum(), given)
+        assert slope.isfinite().all() and slope[[0, 2]].abs().amax(1).min() > 1
+        slopes.append(slope)
+    torch.testing.assert_close(slopes[0][[0, 2]], slopes[1][[0, 2]], rtol=1e-7, atol=1e-7)
+
+
 def test_many_states_in_chunks_and_few(monkeypatch):
     postures = PartPostures(Body.of_height(BODY_15, 1.75))
     states = 0.2 * torch.randn(50, 36, generator=G)

@@ -13,8 +13,8 @@ from torch.nn.functional import normalize
 from torchpose._core.checks import check_shape
 from torchpose.body._kinematics import Body
 from torchpose.math._tree_messages import tree_levels
-from torchpose.priors._actions.polar_limbs import LIMB_PARENTS, LIMBS_12, POSTURE_DIM
-from torchpose.priors._actions.postures import check_body
+from torchpose.priors._actions.polar_limbs import LIMB_PARENTS, LIMBS_12
+from torchpose.priors._actions.postures import angles_of_directions, check_body
 
 Vectors = tuple[Tensor, Tensor, Tensor]  # x, y, z, each [k, n]
 
@@ -88,7 +88,10 @@ class PartPostures(nn.Module):
         vectors = relative.T.reshape(relative.shape[1] // 3, 3, len(relative))
         squared = vectors.square().sum(1)
         u = (vectors * squared.clamp_min(1).rsqrt()[:, None]).unbind(1)  # [P - 1, n] each
-        w = (1 - squared).clamp_min(0).sqrt()
+        w = (1 - squared).clamp_min(0)
+        if torch.is_grad_enabled():  # of half turns, as `vector_to_quaternion`
+            w = torch.where(w > 0, w, w.detach())
+        w = w.sqrt()
         x, y, z = (b[:, None].repeat(1, len(relative)) for b in self.bones.unbind(1))
         for turn in self._turns:
             by = [part - 1 for part in turn.by]
@@ -102,8 +105,7 @@ class PartPostures(nn.Module):
             seen = [c[carry.by] for c in (x, y, z)]
             back = _carried_back(seen, straight, [c[carry.vectors] for c in (x, y, z)])
             x, y, z = _placed((x, y, z), carry.vectors, back)
-        sines = torch.stack([x, y, z], 1).view(POSTURE_DIM, -1).T
-        return torch.rad2deg(sines.clamp(-1, 1).asin())
+        return angles_of_directions(torch.stack([x, y, z], 1).movedim(-1, 0))
 
     def _in_root_axes(self, x: Tensor, y: Tensor, z: Tensor) -> Vectors:
         """Turn axes with x along the hips to those with y along the spine, at right angles to x."""

@@ -78,7 +78,7 @@ def posture_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batc
         u = torch.where(known[level.limbs, None], u, rest[level.limbs])
         local[..., level.limbs, :] = u
         axes = _carry(axes, u, level)
-    return _angles(local)
+    return angles_of_directions(local)
 
 
 def posture_root(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -134,7 +134,7 @@ def normalise_postures(postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*
     Args:
         postures: [..., 36], degrees.
     """
-    return _angles(_local_directions(postures))
+    return angles_of_directions(_local_directions(postures))
 
 
 def posture_directions(
@@ -218,7 +218,7 @@ def _local_directions(postures: Tensor) -> Tensor:
     return torch.nn.functional.normalize(torch.where(none, _axes("rest", sines), sines), dim=-1)
 
 
-def _angles(directions: Tensor) -> Tensor:
+def angles_of_directions(directions: Tensor) -> Tensor:
     """Return the angles [..., 36] of unit directions [..., 12, 3] to the planes of their axes, degrees.
 
     An angle of 90 degrees falls on every side, so that its gradient is 0: that of arcsin is infinite.
