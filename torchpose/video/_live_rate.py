@@ -7,9 +7,7 @@ from statistics import fmean, median
 from typing import Any, NamedTuple
 
 _TELLING = 30  # intervals between frames that tell their rate
-_WRONG = (
-    0.2  # share by which rates differ that give wrong motion; the clocks of drivers jitter by less
-)
+_WRONG = 0.2  # share by which a rate is another one, as for `CameraSource`; clocks jitter by less
 _PAUSE = 1.0  # seconds without a frame, which are a pause
 
 
