@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 import torchpose
-from torchpose._core.checks import check_positive
+from torchpose._core.checks import check_positive, check_seed
 from torchpose._core.digests import digest_of
 from torchpose._core.files import atomic_path
 from torchpose.errors import InputError, OutputError
@@ -44,6 +44,7 @@ class BatchTracker:
         for option, value in (("track.fps", settings.fps), ("track.max_gap", settings.max_gap)):
             if value is not None:
                 check_positive(option, value)
+        check_seed("track.seed", settings.seed)
         self._tracker = KeypointFileTracker(settings, device)
         self._tracker.check()
 

@@ -290,6 +290,12 @@ def test_folders_of_other_programs_are_recordings(tmp_path) -> None:
     assert find_keypoints([tmp_path / "cam"]).recordings == [found._replace(n_frames=2)]
 
 
+@pytest.mark.parametrize("seed", [-1, 2**64])
+def test_a_seed_that_torchpose_track_refuses_is_refused(prior_file, seed) -> None:
+    with pytest.raises(InputError, match=r"track\.seed must be a whole number from 0 on"):
+        BatchTracker(TrackSettings(prior=prior_file, seed=seed))
+
+
 def test_what_files_of_settings_hold_is_part_of_the_task(prior_file, tmp_path) -> None:
     file, tasks = tmp_path / "arms.safetensors", []
     for name in ("one", "two"):

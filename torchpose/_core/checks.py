@@ -31,6 +31,7 @@ _RGB_ADVICE = (
     "; cv2.cvtColor converts BGR, RGBA and grey, np.asarray a PIL image, and (255 * image).astype(np.uint8) "
     "values from 0 to 1"
 )
+_SEEDS = 2**63
 _SEVERAL = 3  # keypoints that tell whether most are shares
 
 
@@ -245,6 +246,12 @@ def check_count(name: str, value: int) -> None:
         raise InputError(f"{name} must be a whole number, got {value!r:.60}")
     if value < 1:
         raise InputError(f"{name} must be at least 1, got {value}")
+
+
+def check_seed(name: str, seed: int) -> None:
+    """Raise `InputError` unless a seed is a whole number that all generators take."""
+    if not (isinstance(seed, Integral) and 0 <= seed < _SEEDS):
+        raise InputError(f"{name} must be a whole number from 0 on, below 2**63, got {seed!r:.60}")
 
 
 def check_weights(name: str, weights: Tensor) -> None:

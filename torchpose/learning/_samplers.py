@@ -7,7 +7,6 @@ blocks see the same states as one process that takes all of them, without paddin
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_seed, check_shape
 from torchpose._core.rows import joined
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError
@@ -72,10 +71,9 @@ def derived_seed(seed: int, purpose: str) -> int:
     """Return a seed for one purpose, so that random numbers of different purposes are independent.
 
     Raises:
-        InputError: a seed that is no whole number from 0 on.
+        InputError: a seed that is no whole number from 0 on, or too long.
     """
-    if not (isinstance(seed, Integral) and seed >= 0):
-        raise InputError(f"seed must be a whole number from 0 on, got {seed!r}")
+    check_seed("seed", seed)
     words = np.random.SeedSequence([seed, *purpose.encode()]).generate_state(1, np.uint64)
     return int(words[0]) >> 1
 
