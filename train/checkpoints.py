@@ -1,5 +1,6 @@
 """Write checkpoints of fits that are complete, and refuse those of another fit."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
@@ -9,8 +10,8 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from torchpose._core.files import atomic_path, clear_leftovers
-from torchpose.errors import FileFormatError, InputError
+from torchpose._core.files import atomic_path, check_output_folder, hold_folder
+from torchpose.errors import FileFormatError, InputError, OutputError
 
 __all__ = [
     "ENTRY",
@@ -39,15 +40,43 @@ class LastCheckpoint(Checkpoint):
 
     Attributes:
         written: whether this run has written one; there may be one of an earlier run.
+
+    Raises:
+        OutputError: when set up: another fit writes its checkpoints there, or the folder cannot be made.
     """
 
     def __init__(self) -> None:
         self.written = False
+        self._lock: int | None = None
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Remove temporary files of a killed fit."""
-        if trainer.is_global_zero:
-            clear_leftovers(checkpoint_file(trainer.default_root_dir).parent)
+        """Keep other fits out of the folder, and remove temporary files of a killed one."""
+        if not trainer.is_global_zero:
+            return
+        folder = check_output_folder(
+            checkpoint_file(trainer.default_root_dir).parent, "--trainer.default_root_dir"
+        )
+        self._lock, held = hold_folder(folder)
+        if held is False:
+            raise OutputError(
+                f"{folder}: another fit is writing its checkpoints there; wait until it ends, or give one of "
+                "them another --trainer.default_root_dir"
+            )
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Let other fits in."""
+        self._release()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Let other fits in."""
+        self._release()
+
+    def _release(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the checkpoint."""

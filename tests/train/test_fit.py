@@ -2,7 +2,9 @@
 
 import csv
 import errno
+import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
 from tests.train.people import RECIPE, WINDOWS, settings, write_recordings, write_settings
+from torchpose._core.files import hold_folder
 from torchpose.io import read_recordings
 from torchpose.learning._curation import CurationSettings, curate
 from torchpose.learning._recipes import UpperBodyRecipe
@@ -167,6 +170,25 @@ def test_other_checkpoints_are_refused(case, fitted, tmp_path, capsys):
     assert code == 2 and message in printed
     assert len(printed.splitlines()) == 1 and printed.startswith("train: error: ")
     assert {p: p.read_bytes() for p in fitted.glob("p.*")} == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="locks of POSIX")
+def test_two_fits_do_not_share_checkpoints(fitted, recordings, tmp_path, capsys):
+    """Each wrote over the other's, and neither could be resumed."""
+    shutil.copytree(fitted / "runs", tmp_path / "runs")
+    last = tmp_path / "runs" / "checkpoints" / "last.ckpt"
+    before = last.read_bytes()
+    line = ["fit", "--config", str(write_settings(tmp_path, settings(recordings, tmp_path)))]
+    handle, _ = hold_folder(last.parent)
+    try:
+        assert main(line) == 2
+    finally:
+        os.close(handle)
+    assert "another fit is writing its checkpoints there" in capsys.readouterr().err
+    assert last.read_bytes() == before and not (tmp_path / "p.safetensors").exists()
+    assert main([*line, "--trainer.max_epochs", "0"]) == 2  # let in again, and again after an error
+    assert main([*line, "--trainer.max_epochs", "0"]) == 2
+    assert "the trainer took no step" in capsys.readouterr().err
 
 
 def test_early_stopping_on_held_out_persons_stays_stopped(recordings, tmp_path):

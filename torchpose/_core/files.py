@@ -19,6 +19,7 @@ __all__ = [
     "check_output_folder",
     "clear_leftovers",
     "hold",
+    "hold_folder",
     "read_npz",
     "require_file",
     "write_npz",
@@ -53,6 +54,19 @@ def hold(handle: int, wait: bool = False) -> bool | None:
     except OSError:  # a file system without locks
         return None
     return True
+
+
+def hold_folder(folder: Path) -> tuple[int | None, bool | None]:
+    """Return a descriptor that holds a lock on a folder until it is closed, and what `hold` says."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows opens no folders
+        return None, None
+    held = hold(handle)
+    if held:
+        return handle, True
+    os.close(handle)
+    return None, held
 
 
 def clear_leftovers(folder: str | Path) -> None:

@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from torchpose._core.digests import digest_of_files
-from torchpose._core.files import as_output_error, atomic_path, check_output_folder, hold
+from torchpose._core.files import (
+    as_output_error,
+    atomic_path,
+    check_output_folder,
+    hold,
+    hold_folder,
+)
 from torchpose._core.reading import npz_keys
 from torchpose._core.wording import first_of
 from torchpose.errors import OutputError, TorchposeError
@@ -134,7 +140,7 @@ class ResultsFolder:
         stage = self.folder / f".torchpose-{self._kind}"
         while True:
             stage.mkdir(exist_ok=True)
-            lock, held = _lock_folder(stage)
+            lock, held = hold_folder(stage)
             if held is False:
                 raise OutputError(
                     f"{self.folder}: another run is writing into this folder; wait until it ends, or "
@@ -313,19 +319,6 @@ def _same_file(path: Path, other: Path) -> bool:
         return os.path.samefile(path, other)
     except OSError:
         return False
-
-
-def _lock_folder(folder: Path) -> tuple[int | None, bool | None]:
-    """Return a descriptor that holds a lock, and what `hold` says."""
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:  # Windows opens no folders
-        return None, None
-    held = hold(handle)
-    if held:
-        return handle, True
-    os.close(handle)
-    return None, held
 
 
 @contextlib.contextmanager
