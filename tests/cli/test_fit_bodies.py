@@ -29,6 +29,7 @@ from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
 from torchpose.priors._actions.postures import posture_angles, posture_to_state
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._limb_conditionals import LimbConditionals
+from torchpose.viz import _model_pictures
 
 LOADERS = {
     "manifold": BackConstrainedGPLVM.load,
@@ -232,6 +233,25 @@ def test_one_action_is_a_space(torchpose, exercises, tmp_path):
     assert format_of(out) == "torchpose-action-space"
     assert ActionSpace.load(out).info.extra["postures"] == "body"
     assert out.with_suffix(".md").read_text().startswith("# action0")
+
+
+def test_pictures_of_a_bank_have_names_of_files_and_go_with_it(
+    torchpose, exercises, tmp_path, monkeypatch
+):
+    """A slash ended the command after the bank was written, and pictures of another bank stayed."""
+    figure = pytest.importorskip("matplotlib.figure").Figure
+    monkeypatch.setattr(_model_pictures, "plot_action_space", lambda *_: figure((1, 1)))
+    for path in exercises.glob("*.npz"):
+        with np.load(path) as archive:
+            action = str(archive["action"]).replace("action", "sit/stand ")
+            np.savez(tmp_path / path.name, **{**archive, "action": action})
+    line = ["fit", "actions", tmp_path, "--out", tmp_path / "bank.safetensors", "--n-dimensions", 4]
+    done = torchpose(*line, "--actions", "sit/stand 0", "sit/stand 1")
+    assert done.code == 0, done.err
+    pictures = {"bank-sit_stand 0.png", "bank-sit_stand 1.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == pictures
+    assert torchpose(*line, "--actions", "sit/stand 0").code == 0
+    assert [path.name for path in tmp_path.glob("*.png")] == ["bank.png"]
 
 
 def test_the_motion_of_bodies_says_how_others_move(torchpose, walks, tmp_path):

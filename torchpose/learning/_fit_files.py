@@ -16,6 +16,9 @@ from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 _SHOWN = 3  # persons
+_NO_NAME = re.compile(
+    r'[/\\:*?"<>|\x00-\x1f]'
+)  # what names of files hold nowhere, or not on Windows
 
 
 def check_fit_file(name: str | Path) -> Path:
@@ -42,7 +45,7 @@ def fit_results(out: Path, inputs: Iterable[str | Path], pictures: bool) -> Resu
     return ResultsFolder(
         out.parent,
         f"fit-{out.stem}",
-        rf"{re.escape(out.stem)}\.(safetensors|md|png)",
+        rf"{re.escape(out.stem)}(\.(safetensors|md|png)|-.+\.png)",
         [out.name, *(out.with_suffix(suffix).name for suffix in beside)],
         inputs,
         lambda _: out.is_file() and (format_of(out) or "").startswith("torchpose"),
@@ -159,7 +162,9 @@ def write_action_files(
 
         return lambda: plot_action_space(*fitted.spaces[action])
 
-    names = {f"{stem}-{a}.png" if several else f"{stem}.png": a for a in fitted.spaces}
+    names = {
+        f"{stem}-{_NO_NAME.sub('_', a)}.png" if several else f"{stem}.png": a for a in fitted.spaces
+    }
     pictures = {name: drawing(action) for name, action in names.items()} if picture else None
     return write_body_model(fitted.result(**facts), fitted.summary(), results, file, pictures)
 
