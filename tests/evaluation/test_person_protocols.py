@@ -24,6 +24,7 @@ from torchpose.evaluation._learning_curve import cyclic_subsets, halves
 from torchpose.evaluation._person_recordings import POSE_CLASSES
 from torchpose.evaluation._person_tables import mean_error
 from torchpose.io import read_recordings
+from torchpose.priors import load_prior
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 MHAD = SKELETONS["mhad-16"].joints
@@ -74,7 +75,7 @@ def made_up_scores(jobs, *_):
     """Scores of jobs, none of which is run: three frames of every person."""
     values = torch.full((3, 8), 0.05)
     score = unseen.Scored(values, values, values[:, None].expand(3, 2, 8) > 1, values[:, 0],
-                          values[:, :2].long())  # fmt: skip
+                          values[:, :2].long(), 2 * values)  # fmt: skip
     return [dict.fromkeys(job.tests, score) for job in jobs]
 
 
@@ -146,11 +147,35 @@ def test_only_persons_whom_files_name_are_scored(tmp_path, monkeypatch):
     report = leave_one_person_out.run(tmp_path, tmp_path / "out", progress=False)
     tests = {job.label: [len(r) for r in job.tests[job.label]] for job in ran}
     assert tests == {"alice": [30], "bob": [30]}
+    persons = report["persons"]
+    assert (persons["alice", "mean pose"], persons["mean", "filtered"]) == pytest.approx((10, 5))
+    assert "The mean poses of the priors are 10.00 cm off" in report.findings[0]
     assert [[r.person_id for r in job.train] for job in ran] == [["bob#"], ["alice#"]]
     assert report.findings[-1].startswith("Other people in both.csv are left out (1 recording)")
     people = read_recordings(tmp_path / "bob")[0]
     one, other = (replace(people, person="s1", source=source) for source in "ab")
     assert list(persons_module.by_person([one, other])) == ["a#s1", "b#s1"]
+
+
+def test_names_may_have_digits_that_are_no_numbers(tmp_path):
+    write_table(tmp_path / "own.csv" / "own.csv", poses(30, 0))
+    people = read_recordings(tmp_path)[0]
+    named = [replace(people, person=name) for name in ("P²", "P10", "P9")]
+    assert list(persons_module.by_person(named)) == ["P9", "P10", "P²"]
+
+
+def test_scores_of_another_release_are_made_again(tmp_path, monkeypatch):
+    """Its trackers gave other numbers, which were taken for those of this one."""
+    made = []
+    job = unseen.Job("", [], {"a": []}, {})
+    score = made_up_scores([job])[0]["a"]
+    score = score._replace(inside=score.inside.float())
+    monkeypatch.setattr(unseen, "score_person", lambda *_: made.append(score) or score)
+    prior = load_prior("kinect-upper-body-small")
+    for version, count in (("1", 1), ("1", 1), ("2", 2)):
+        monkeypatch.setattr(unseen, "package_version", lambda version=version: version)
+        unseen._scored_at(prior, job, 30.0, [torch.zeros(10, 8, 3)], tmp_path, False)
+        assert len(made) == count
 
 
 def test_mirrored_recordings_are_said(tmp_path):
@@ -283,7 +308,7 @@ def test_counts_double_up_to_all():
 def test_a_point_of_the_curve():
     def scored(error):
         values = torch.full((3, 8), error / 100)
-        return unseen.Scored(values, values, values, values[:, 0], values[:, :2].long())
+        return unseen.Scored(values, values, values, values[:, 0], values[:, :2].long(), values)
 
     results = [
         {"b": scored(4.0), "c": scored(8.0)},

@@ -126,7 +126,8 @@ def _add_findings(report: Report, scored: dict[str, Scored]) -> None:
         f"Over {len(names)} persons: {mean:.2f} ± {wide:.2f} cm filtered, {late:.2f} ± "
         f"{late_wide:.2f} cm smoothed (standard deviation over persons; that of the mean is "
         f"{wide / len(names) ** 0.5:.2f}). Best {best} with {table[best, 'filtered']:.2f}, worst "
-        f"{worst} with {table[worst, 'filtered']:.2f}."
+        f"{worst} with {table[worst, 'filtered']:.2f}. The mean poses of the priors are "
+        f"{spread(numbers('mean pose'))[0]:.2f} cm off."
     )
     parts = [
         f"{column[3:]}: {spread(numbers(column))[0]:.0f} ± {spread(numbers(column))[1]:.0f} %"

@@ -106,8 +106,8 @@ def _folder(recording: Recording) -> str:
 
 def _natural(name: str) -> tuple[Any, ...]:
     """Return a key by which s2 comes before s10."""
-    digits = "".join(c if c.isdigit() else " " for c in name).split()
-    return ("".join(c for c in name if not c.isdigit()), *map(int, digits))
+    digits = "".join(c if c.isdecimal() else " " for c in name).split()
+    return ("".join(c for c in name if not c.isdecimal()), *map(int, digits))
 
 
 def renamed(recordings: Sequence[Recording], suffix: str) -> list[Recording]:

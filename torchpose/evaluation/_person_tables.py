@@ -28,10 +28,19 @@ def add_persons(report: Report, persons: Mapping[str, Scored]) -> Table:
         "persons",
         "3D error after Procrustes (cm), true joints inside the ellipsoids (%), log-likelihood of "
         "the pose (nats)",
-        ["frames", "filtered", "smoothed", "in 50 %", "in 90 %", "log-lik.", *SHORT_NAMES],
-        digits=(0, 2, 2, 0, 0, 2, *[1] * 8),
-        note="Joints: filtered. Ellipsoids: of the filter. Mean and standard deviation are over "
-        "persons, each counting once; 'all frames' counts every frame once.",
+        [
+            "frames",
+            "mean pose",
+            "filtered",
+            "smoothed",
+            "in 50 %",
+            "in 90 %",
+            "log-lik.",
+            *SHORT_NAMES,
+        ],
+        digits=(0, 2, 2, 2, 0, 0, 2, *[1] * 8),
+        note="The mean pose is that of the prior. Joints: filtered. Ellipsoids: of the filter. Mean and "
+        "standard deviation are over persons, each counting once; 'all frames' counts every frame once.",
     )
     rows = {name: _row(scored) for name, scored in persons.items()}
     for name, row in rows.items():
@@ -48,7 +57,8 @@ def _row(scored: Scored) -> list[float | int]:
     low, high = (100 * scored.inside.double().nanmean((0, 2))).tolist()
     joints = (100 * scored.filtered.double().nanmean(0)).tolist()
     likelihood = float(scored.log_likelihood.nanmean())
-    errors = mean_error(scored), mean_error(scored, smoothed=True)
+    still = 100 * float(scored.still.double().nanmean())
+    errors = still, mean_error(scored), mean_error(scored, smoothed=True)
     return [len(scored.filtered), *errors, low, high, likelihood, *joints]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -44,11 +44,11 @@ from torchpose.evaluation._unseen import (
     Scored,
     compare,
     log_likelihood,
+    mean_pose_errors,
     pooled,
     poses_by_rate,
 )
 from torchpose.io._recordings import Recording
-from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
 from torchpose.priors._arms import shipped_arm_prior
 from torchpose.priors._upper_body_prior import UpperBodyPrior, load_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -58,10 +58,9 @@ _SEEN = {"head+hands": MEASURED, "all": UPPER_BODY}
 
 
 class _PersonScores(NamedTuple):
-    """Holds the scores of a person, and the errors of the prior's mean pose [N, 8], metres."""
+    """Holds the scores of a person, and whether the neck is of the prior's kind."""
 
     scored: Scored
-    baseline: Tensor
     same_neck: bool
 
 
@@ -185,7 +184,7 @@ def _score(
     left_out = () if same_neck else ("neck",)
     names = tuple(joint for joint in names if joint not in left_out)
     counted = torch.tensor([joint not in left_out for joint in UPPER_BODY])
-    parts, baselines = [], []
+    parts = []
     for fps, poses in poses_by_rate(recordings, prior, None, name).items():
         test = make_test_set(poses, CAMERA, fps, seed, noise_std, names=names)
         filtered, inside = _tracked(prior, test, counted, method, seed)
@@ -197,10 +196,10 @@ def _score(
         if same_neck:
             likelihood = log_likelihood(prior, truth, seed)
         parts.append(Scored(
-            filtered.float(), smoothed.float(), inside.float(), likelihood, pose_classes(truth)
+            filtered.float(), smoothed.float(), inside.float(), likelihood, pose_classes(truth),
+            mean_pose_errors(prior, truth, counted),
         ))  # fmt: skip
-        baselines.append(_mean_pose_errors(prior, truth, counted))
-    return _PersonScores(pooled(parts), torch.cat(baselines), same_neck)
+    return _PersonScores(pooled(parts), same_neck)
 
 
 def _tracked(
@@ -218,16 +217,6 @@ def _tracked(
     return compare(estimate, test, counted)
 
 
-def _mean_pose_errors(
-    prior: UpperBodyPrior, truth: Float[Tensor, "N 8 3"], counted: Bool[Tensor, " 8"]
-) -> Float[Tensor, "N 8"]:
-    """Return the errors of the prior's mean pose, aligned as estimates are."""
-    on = [joint for joint in ALIGN_JOINTS if bool(counted[joint])]
-    still = prior.mean_pose().to(truth).expand_as(truth)
-    errors = joint_errors(align(still, truth, on).points, truth)
-    return errors.masked_fill(~counted, torch.nan).float()
-
-
 # --- the report -----------------------------------------------------------------------------------
 
 
@@ -242,8 +231,7 @@ def _add_joints(report: Report, found: Mapping[str, _PersonScores]) -> None:
         "better than it has learnt nothing from the keypoints.",
     )
     everybody = pooled([scores.scored for scores in found.values()])
-    baseline = torch.cat([scores.baseline for scores in found.values()])
-    errors = [baseline, everybody.filtered, everybody.smoothed]
+    errors = [everybody.still, everybody.filtered, everybody.smoothed]
     for j, joint in enumerate(UPPER_BODY):
         means = [100 * float(e[:, j].double().nanmean()) for e in errors]
         inside = (100 * everybody.inside[:, :, j].double().nanmean(0)).tolist()
@@ -255,7 +243,7 @@ def _add_joints(report: Report, found: Mapping[str, _PersonScores]) -> None:
 
 def _add_findings(report: Report, found: Mapping[str, _PersonScores], known: Sequence[str]) -> None:
     errors = [mean_error(scores.scored) for scores in found.values()]
-    still = [100 * float(scores.baseline.double().nanmean()) for scores in found.values()]
+    still = [100 * float(scores.scored.still.double().nanmean()) for scores in found.values()]
     (mean, wide), (base, _) = spread(errors), spread(still)
     persons = counted(len(found), "person")
     deviation = f" ± {wide:.2f}" if len(found) > 1 else ""

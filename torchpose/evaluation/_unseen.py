@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.facade import package_version
 from torchpose._core.frame_rates import group_by_rate
 from torchpose._core.rows import joined
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
@@ -83,6 +84,7 @@ class Scored(NamedTuple):
             it is not. log_likelihood: of the pose under the prior's mixtures over poses, mean of
             both arms, nats; NaN if it was not asked for.
         classes: what the left and the right arm do, index into `persons.POSE_CLASSES`.
+        still: errors of the prior's mean pose, which looks at nothing; metres, aligned as those of tracking.
     """
 
     filtered: Float[Tensor, "N 8"]
@@ -90,6 +92,7 @@ class Scored(NamedTuple):
     inside: Float[Tensor, "N L 8"]
     log_likelihood: Float[Tensor, " N"]
     classes: Int[Tensor, "N 2"]
+    still: Float[Tensor, "N 8"]
 
 
 def pooled(parts: Sequence[Scored]) -> Scored:
@@ -208,7 +211,14 @@ def _scored_at(
     progress: bool,
 ) -> Scored:
     """Return the scores of sequences at one frame rate, read from the folder if they are there."""
-    facts = ["scores 1", repr(job.test), fps, *prior.state_dict().values(), *poses]
+    facts = [
+        "scores 2",
+        package_version(),
+        repr(job.test),
+        fps,
+        *prior.state_dict().values(),
+        *poses,
+    ]
     path = folder / f"scores-{settings_hash(facts)}.npz"
     found: Scored | None = read_kept(path, Scored, Scored._fields)
     if found is None:
@@ -245,7 +255,7 @@ def score_person(
         likelihood = log_likelihood(prior, truth, settings.seed)
     return Scored(
         filtered[0].float(), smoothed[0].float(), filtered[1].float(), likelihood,
-        pose_classes(truth),
+        pose_classes(truth), mean_pose_errors(prior, truth, scored),
     )  # fmt: skip
 
 
@@ -268,6 +278,16 @@ def compare(found: Estimate, test: Trials, scored: Bool[Tensor, " 8"]) -> tuple[
     radius = chi2_quantile(torch.tensor(LEVELS, dtype=torch.float64))
     hits = (squared[:, None] <= radius[:, None]).double()
     return errors, hits.masked_fill(~scored, torch.nan)
+
+
+def mean_pose_errors(
+    prior: UpperBodyPrior, truth: Float[Tensor, "N 8 3"], scored: Bool[Tensor, " 8"]
+) -> Float[Tensor, "N 8"]:
+    """Return the errors of the prior's mean pose, aligned as estimates are; NaN if unscored."""
+    on = [joint for joint in ALIGN_JOINTS if bool(scored[joint])]
+    still = prior.mean_pose().to(truth).expand_as(truth)
+    errors = joint_errors(align(still, truth, on).points, truth)
+    return errors.masked_fill(~scored, torch.nan).float()
 
 
 def log_likelihood(
