@@ -281,6 +281,16 @@ def test_persons_with_one_recording_have_no_prior_of_their_own(data, tmp_path, m
     assert any("with one recording only: s1, s7." in line for line in report.findings)
 
 
+def test_a_copy_is_not_in_the_other_half_of_a_person(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(learning_curve, "run_jobs", made_up_scores)
+    home = shutil.copytree(data / "kinect_utd_mhad", tmp_path / "home")
+    shutil.copy(home / "s1_a01_t0.npz", home / "s1_a01_t9.npz")
+    options = {"progress": False, "counts": (1,), "n_subsets": 1, "recipes": [("r", recipe)]}
+    with pytest.raises(OverlapError, match=r"s1_a01_t9.*would be in the test"):
+        learning_curve.run(home, tmp_path / "out", **options)
+    learning_curve.run(home, tmp_path / "out", n_own=0, **options)
+
+
 def test_learning_curve_of_any_recordings(data, tmp_path):
     """Folders of other names, with counts that go with the persons, and persons of a third folder."""
     one = write_people(tmp_path / "mine" / "a", ("ann", "bob"), n_frames=FRAMES)

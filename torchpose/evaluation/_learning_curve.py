@@ -38,7 +38,10 @@ from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, pooled, run_jobs
 from torchpose.io._recordings import Recording
-from torchpose.learning._curation.splits import refuse_shared_between_persons
+from torchpose.learning._curation.splits import (
+    refuse_shared_between_persons,
+    refuse_shared_recordings,
+)
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 _PUBLISHED, _FURTHER = "kinect_utd_mhad", ("burke_kinect", "kinect_laban")
@@ -89,7 +92,8 @@ def run(
 
     Raises:
         InputError: no such data, more training persons than there are, an unknown recipe, settings out
-            of range. OverlapError: one recording under two persons. OutputError: `out` cannot be written.
+            of range. OverlapError: one recording under two persons, or in both halves of one.
+            OutputError: `out` cannot be written.
     """
     for setting, value in {"every": every, "workers": workers, "n_subsets": n_subsets}.items():
         check_count(setting, value)
@@ -289,11 +293,16 @@ def _own_jobs(
     """Return fits to persons' first halves, of all others, and of both; scored on second halves.
 
     Persons with one recording have no second half, and are trained on only.
+
+    Raises:
+        OverlapError: a recording is in one half of a person, and a copy of it in the other one.
     """
     later = {name: halves(group)[1] for name, group in persons.items() if len(group) > 1}
     jobs: dict[tuple[str, str, str], Job] = {}
     for (recipe, fitting), person in product(fittings.items(), list(later)[:n_own]):
-        mine = renamed(halves(persons[person])[0], "first half")
+        first = halves(persons[person])[0]
+        refuse_shared_recordings(first, later[person])
+        mine = renamed(first, "first half")
         rest = [r for name, group in persons.items() if name != person for r in group]
         on = {person: later[person]}
         jobs |= {
