@@ -59,7 +59,6 @@ class ActionFit(BodyFit):
     Args:
         n_dimensions, n_postures, prominence, stay, spread, background, evidence_rate, gate_dimensions,
             seed: see `ActionRecipe`.
-        picture: draw the synchronised performances of each action beside the file.
     """
 
     data_type, what = ActionData, "actions are"
@@ -75,7 +74,6 @@ class ActionFit(BodyFit):
         evidence_rate: float = BankInfo.evidence_rate,
         gate_dimensions: int | None = None,
         seed: int = 0,
-        picture: bool = True,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
@@ -90,10 +88,9 @@ class ActionFit(BodyFit):
             found["accepted"] = list(fitted.accepted.values())
         return {k: float(torch.tensor(v).double().mean()) for k, v in found.items()}
 
-    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
-        """Write the action space or bank, and its picture."""
-        picture = bool(self.hparams["picture"])
-        return write_action_files(self._fit(), results, file, picture, **facts)
+    def write(self, results: ResultsFolder, file: str, pictures: bool, **facts: str) -> str:
+        """Write the action space or bank, and pictures of the synchronised performances of each action."""
+        return write_action_files(self._fit(), results, file, pictures, **facts)
 
     def _fit(self) -> FittedActions:
         if self._fitted is None:  # after a resumed run, too, whose step is not done again

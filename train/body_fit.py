@@ -91,7 +91,7 @@ class BodyFit(LightningModule):
     def settings(self) -> dict[str, Any]:
         """Return all settings that matter to the result."""
         given: Any = self.hparams
-        return {k: v for k, v in given.items() if k != "picture" and not k.startswith("_")}
+        return {k: v for k, v in given.items() if not k.startswith("_")}
 
     def configure_optimizers(self) -> Sequence[Optimizer]:
         """Return no optimiser that Lightning would step."""
@@ -126,11 +126,12 @@ class BodyFit(LightningModule):
         """Log numbers of this step in double precision."""
         self.log_dict({k: torch.tensor(float(v)).double() for k, v in found.items()}, on_step=True)
 
-    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+    def write(self, results: ResultsFolder, file: str, pictures: bool, **facts: str) -> str:
         """Write the model's file and its card, and return what to say of it; a subclass does.
 
         Args:
-            results, file: where a prior's file would be. facts: name, licence, command.
+            results, file: where a prior's file would be. pictures: draw them, where there are any.
+            facts: name, licence, command.
         """
         raise NotImplementedError
 

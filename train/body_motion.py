@@ -85,7 +85,7 @@ class BodyMotionFit(BodyFit):
             return {"frames": sum(len(s.residual) for s in self.gathered.train)}
         return {"acceleration": held_out.acceleration, "log_density": held_out.log_density}
 
-    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+    def write(self, results: ResultsFolder, file: str, pictures: bool, **facts: str) -> str:
         """Write the prior."""
         found, held_out = fit_motion(self.gathered, self._recipe, **facts)
         return write_body_model(found, motion_summary(found, held_out), results, file)

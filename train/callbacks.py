@@ -158,7 +158,8 @@ class PriorWriter(Callback):
 
     Args:
         out: the prior, NAME.safetensors. name: in its metadata, that of the file by default.
-        licence: of the recordings. command: that makes it. pictures: draw its mean poses.
+        licence: of the recordings. command: that makes it. pictures: draw its mean poses, the
+            latent space of a manifold, or the performances of actions.
 
     Attributes:
         ended: whether the fit came to its end.
@@ -202,7 +203,9 @@ class PriorWriter(Callback):
         """Write what was fitted, and return what to say of it; None where another process writes."""
         if isinstance(module, BodyFit):
             here = module.trainer.is_global_zero
-            return module.write(self.results, self.out.name, **self._facts) if here else None
+            if not here:
+                return None
+            return module.write(self.results, self.out.name, self._pictures, **self._facts)
         finish = getattr(module, "finished_prior", None)
         prior = finish(**self._facts) if finish else None
         if prior is None:

@@ -64,7 +64,7 @@ class LimbFit(BodyFit):
             return {"frames": sum(map(len, self.gathered.train))}
         return {"deviation": held_out.deviation, "speed": held_out.speed}
 
-    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
+    def write(self, results: ResultsFolder, file: str, pictures: bool, **facts: str) -> str:
         """Write the conditionals."""
         found, held_out = fit_limbs(self.gathered, self.settings["least_std"], **facts)
         return write_body_model(found, limb_summary(found, held_out), results, file)

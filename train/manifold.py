@@ -59,7 +59,6 @@ class ManifoldFit(BodyFit):
     Args:
         latent_dim, gamma_x, optimiser, learning_rate, steps, patience, start, smoothness, standardise,
             seed: see `ManifoldRecipe`.
-        picture: draw the latent space beside the file.
 
     Raises:
         InputError: a setting that is not positive.
@@ -79,7 +78,6 @@ class ManifoldFit(BodyFit):
         smoothness: float = 0.0,
         standardise: bool = False,
         seed: int = 0,
-        picture: bool = True,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
@@ -112,7 +110,6 @@ class ManifoldFit(BodyFit):
         """Stop at once if the fit had come to its end."""
         self._stopped = bool(kept["stopped"])
 
-    def write(self, results: ResultsFolder, file: str, **facts: str) -> str:
-        """Write the manifold, and its picture."""
-        picture = bool(self.hparams["picture"])
-        return write_manifold_files(self.fitting, results, file, picture, **facts)
+    def write(self, results: ResultsFolder, file: str, pictures: bool, **facts: str) -> str:
+        """Write the manifold, and a picture of its latent space."""
+        return write_manifold_files(self.fitting, results, file, pictures, **facts)

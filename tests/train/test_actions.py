@@ -45,13 +45,13 @@ def scene(tmp_path_factory) -> SimpleNamespace:
         "--data.init_args.held_out": "[p3]",
         "--data.init_args.postures": "joints",
         "--model.init_args.n_dimensions": 5,
-        "--model.init_args.picture": "false",
+        "--prior.pictures": "false",
     }
     return scene_of(home, "actions.yaml", options, folder=folder)
 
 
 def test_it_is_the_fit_of_the_library(scene, capsys) -> None:
-    assert run(scene, "one", "--model.init_args.picture", "true") == 0
+    assert run(scene, "one", "--prior.pictures", "true") == 0
     found = ActionSpace.load(scene.home / "one.safetensors")
     data = Performances.gather([str(scene.folder)], ["action0"], held_out=["p3"])
     assert len(data.train) == 9 and len(data.watched) == 3

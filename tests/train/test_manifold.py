@@ -48,7 +48,7 @@ def scene(tmp_path_factory) -> SimpleNamespace:
         "--model.init_args.steps": 4,
         "--model.init_args.patience": 9,
         "--model.init_args.start": 1,
-        "--model.init_args.picture": "false",
+        "--prior.pictures": "false",
     }
     return scene_of(home, "manifold.yaml", options, folder=folder)
 
@@ -59,7 +59,7 @@ def fitted(scene, name: str) -> BackConstrainedGPLVM:
 
 @pytest.fixture(scope="module")
 def whole(scene) -> BackConstrainedGPLVM:
-    assert run(scene, "whole", "--model.init_args.picture", "true") == 0
+    assert run(scene, "whole", "--prior.pictures", "true") == 0
     return fitted(scene, "whole")
 
 
@@ -146,6 +146,7 @@ def test_several_persons_are_pooled(scene) -> None:
     more = ["--data.init_args.persons", "null", "--model.init_args.steps", "1"]
     assert run(scene, "pooled", *more) == 0
     info = fitted(scene, "pooled").info
+    assert not (scene.home / "pooled.png").exists()  # --prior.pictures was not heard
     assert info.persons == ("set#p0", "set#p1")
     assert info.sequences == ("set#p0",) * 2 + ("set#p1",) * 3
 
