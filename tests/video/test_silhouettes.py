@@ -6,7 +6,7 @@ import torch
 from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, InputError
 from torchpose.video import SilhouetteMeasurer, VideoFrame, VideoSource, read_silhouettes
-from torchpose.video._silhouettes import clean_silhouette, fit_view
+from torchpose.video._silhouettes import clean_silhouette, fit_view, fit_views
 
 
 class Frames(VideoSource):
@@ -162,6 +162,8 @@ def test_bad_input_is_refused():
     view = fit_view(PinholeCamera(300, 300, 159.5, 119.5, 320, 240, "left"), (320, 240), 120, 160)
     with pytest.raises(InputError, match="empty scene"):
         SilhouetteMeasurer(view)
+    with pytest.raises(InputError, match=r"give rows \(--rows\) of 240 at most"):
+        fit_views([view.source], [(320, 240)], 100_000)
     measurer = SilhouetteMeasurer(view, empty=[background])
     with pytest.raises(InputError, match=r"^frames of camera 'left' must have 320 x 240"):
         measurer(background[:100])

@@ -24,6 +24,7 @@ from torchpose.video._source_interface import VideoFrame, VideoSource
 _PART = 0.03  # of the largest piece: smaller ones are no part of the person
 _HOLE = 0.02  # of the silhouette: larger holes are real, such as between arm and body
 _STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, of a static pixel
+_ENLARGED = 4  # times the height of the images, at most
 _LEARNING_FRAMES = 120  # spread over the video
 
 
@@ -84,8 +85,18 @@ def fit_view(
 def fit_views(
     cameras: Sequence[PinholeCamera], sizes: Sequence[tuple[int, int]], rows: int
 ) -> list[SilhouetteView]:
-    """Return `fit_view` of each camera, in images of `rows` rows that are wide enough for all."""
+    """Return `fit_view` of each camera, in images of `rows` rows that are wide enough for all.
+
+    Raises:
+        CameraError: as `fit_view`. InputError: many more rows than the images have.
+    """
     shapes = [camera.image_size or size for camera, size in zip(cameras, sizes, strict=True)]
+    tallest = max(height for _, height in shapes)
+    if rows > _ENLARGED * tallest:
+        raise InputError(
+            f"silhouettes of {rows} rows take long, and tell no more than the images of {tallest} rows; give "
+            f"rows (--rows) of {tallest} at most"
+        )
     width = max(round(w * rows / h) for w, h in shapes)
     return [
         fit_view(camera, size, rows, width) for camera, size in zip(cameras, sizes, strict=True)
