@@ -65,13 +65,21 @@ def end_process(status: int) -> NoReturn:
 
 
 def _predict(arguments: list[str]) -> int:
-    try:
-        from train.predict import main as predict  # takes seconds
+    from train.stopping import raise_if_signalled, signal_of, stopped_by_signals
 
-        return predict(arguments)
-    except KeyboardInterrupt:
-        print("train: interrupted; run the same command again to go on", file=sys.stderr)
-        return 130
+    try:
+        with stopped_by_signals():
+            from train.predict import main as predict  # takes seconds
+
+            raise_if_signalled()
+            code = predict(arguments)
+            raise_if_signalled()  # `main` returns the code of any exit, as that of --help
+            return code
+    except (KeyboardInterrupt, SystemExit) as error:
+        stopped = signal_of(error)
+        if stopped is None:
+            raise
+        return _stop(stopped, "run the same command again to go on")
 
 
 def _fit(arguments: list[str]) -> int:
@@ -88,7 +96,7 @@ def _fit(arguments: list[str]) -> int:
     except BaseException as error:
         stopped = signal_of(error)
         if stopped is not None:
-            return _stop(stopped)
+            return _stop(stopped, _how_to_go_on())
         if isinstance(error, SystemExit):  # --help and --print_config
             return error.code if isinstance(error.code, int) else 0
         text = None if debug else _reason(error, arguments)
@@ -110,14 +118,17 @@ def _reason(error: BaseException, arguments: list[str]) -> str | None:
     return reason(error, arguments)
 
 
-def _stop(stopped: signal.Signals) -> int:
+def _stop(stopped: signal.Signals, how: str) -> int:
     """Say how to resume, and return the exit code that shells give to a process ended by a signal."""
-    command = sys.modules.get("train.command")  # not yet there if it was stopped while loading
-    how = "run the same command again" if command is None else command.how_to_go_on()
     if _rank() == "0":
         what = "interrupted" if stopped == signal.SIGINT else "terminated"
         print(f"train: {what}; {how}", file=sys.stderr)
     return 128 + stopped
+
+
+def _how_to_go_on() -> str:
+    command = sys.modules.get("train.command")  # not yet there if it was stopped while loading
+    return "run the same command again" if command is None else str(command.how_to_go_on())
 
 
 def _rank() -> str:

@@ -6,6 +6,7 @@ begins (`train.predict_claims`). It is done when a result from the same input, p
 so nothing is computed twice and the next run resumes.
 """
 
+import contextlib
 import os
 import sys
 import time
@@ -225,7 +226,9 @@ class Batch(NamedTuple):
             track = self.tracker(recording)
             facts = facts_of(track, started)
             save_result(result, track, origin, facts)
-        except OutputError:
+        except (OutputError, KeyboardInterrupt, SystemExit):
+            with contextlib.suppress(OSError):
+                claim.record("stopped")  # so that it counts as no death at this recording
             raise
         except Exception as error:  # one bad recording does not stop the others
             typed = isinstance(error, TorchposeError)

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+from torchpose._core.files import as_output_error
 from torchpose.errors import InputError, OutputError
 
 try:
@@ -25,7 +26,7 @@ except ImportError:  # Windows
 __all__ = ["Claim", "Claims", "Event", "Run"]
 
 Event = dict[str, Any]
-"""What happened to a recording: `event` ("started", "finished" or "failed"), by whom, and facts."""
+"""What happened to a recording: `event` ("started", "stopped", "finished", "failed"), by whom, and facts."""
 
 
 class Claim(NamedTuple):
@@ -82,8 +83,12 @@ class Claims:
 
     @contextlib.contextmanager
     def claim(self, name: str, wait: bool = False) -> Iterator[Claim | None]:
-        """Hold the claim of a recording; None if another process has it and `wait` is False."""
-        with self.path(name).open("a+b") as stream:
+        """Hold the claim of a recording; None if another process has it and `wait` is False.
+
+        Raises:
+            OutputError: its file cannot be written.
+        """
+        with as_output_error(self._folder), self.path(name).open("a+b") as stream:
             if not self._lock(stream, exclusive=True, wait=wait):
                 yield None
                 return
@@ -97,9 +102,9 @@ class Claims:
             task: what the run does; processes of one run have to have the same.
 
         Raises:
-            InputError: a run with another task is going on.
+            InputError: a run with another task is going on. OutputError: its file cannot be written.
         """
-        with (self._folder / "run.json").open("a+b") as stream:
+        with as_output_error(self._folder), (self._folder / "run.json").open("a+b") as stream:
             if self._lock(stream, exclusive=True, wait=False):
                 begun = json.dumps({"run": uuid.uuid4().hex, "task": task})
                 stream.truncate(0)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.full_disk import files_up_to
 from tests.priors.poses import poses, recording
 from torchpose._core.files import atomic_path
 from torchpose.cli._track import command as track_command
@@ -416,6 +417,27 @@ def test_a_full_disk_ends_the_run_and_a_bug_is_named_with_its_recording(
     monkeypatch.setattr(module, "save_result", full)
     with pytest.raises(OutputError, match="no space"):
         predict([data / "c.npz"], tmp_path / "out", settings)
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, OutputError("no space left")])
+def test_a_run_that_is_stopped_is_no_death(data, prior_file, tmp_path, monkeypatch, stop) -> None:
+    """After three times Ctrl-C the longest recording was given up."""
+    settings = TrackSettings(prior=prior_file)
+
+    def end(*_):
+        raise stop
+
+    with monkeypatch.context() as patch:
+        patch.setattr(BatchTracker, "__call__", end)
+        for _ in range(3):
+            with pytest.raises(stop if isinstance(stop, type) else OutputError):
+                predict([data / "a.npz"], tmp_path / "out", settings)
+    assert predict([data / "a.npz"], tmp_path / "out", settings)["a"].good
+
+
+def test_claims_on_a_full_disk(data, prior_file, tmp_path) -> None:
+    with files_up_to(0), pytest.raises(OutputError, match=r"\.claims: cannot be written"):
+        predict([data / "a.npz"], tmp_path / "out", TrackSettings(prior=prior_file))
 
 
 def test_what_kills_every_process_is_given_up(data, prior_file, tmp_path) -> None:

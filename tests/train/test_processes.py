@@ -98,6 +98,7 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
         ("fit", signal.SIGTERM, True),
         ("fit", signal.SIGINT, True),
         ("predict", signal.SIGINT, False),
+        ("predict", signal.SIGTERM, True),
     ],
 )
 def test_a_signal_while_modules_are_loaded(monkeypatch, capsys, command, signum, lost):
