@@ -157,6 +157,22 @@ def test_only_persons_whom_files_name_are_scored(tmp_path, monkeypatch):
     assert list(persons_module.by_person([one, other])) == ["a#s1", "b#s1"]
 
 
+def test_who_cannot_be_scored_is_told_before_any_fit(data, tmp_path):
+    home = shutil.copytree(data / "kinect_utd_mhad", tmp_path / "home")
+    with np.load(home / "s1_a01_t0.npz") as archive:
+        arrays = dict(archive)
+    joints = arrays["joints"].copy()
+    joints[::5, V1.index("left_hand")] = np.nan
+    np.savez(home / "z_a01_t0.npz", **arrays | {"subject": "z", "joints": joints})
+    (home / "s1_a01_t0.npz").unlink()
+
+    def fit(*_, **__):
+        raise AssertionError("nothing is to be fitted")
+
+    with pytest.raises(InputError, match="z: no 10 frames in a row have all eight joints"):
+        leave_one_person_out.run(home, tmp_path / "out", progress=False, recipe=fit)
+
+
 def test_names_may_have_digits_that_are_no_numbers(tmp_path):
     write_table(tmp_path / "own.csv" / "own.csv", poses(30, 0))
     people = read_recordings(tmp_path)[0]

@@ -151,8 +151,14 @@ def run_jobs(
         Scores of each job by person.
 
     Raises:
-        OverlapError: a person is in the training recordings of a job that scores them.
+        OverlapError: a person is in the training recordings of a job that scores them. InputError: a
+            person to be scored has no complete frames, which is seen before any fit.
     """
+    for job in jobs:
+        for name, recordings in job.tests.items():
+            chosen = recordings[:: job.test.every]
+            if not any(complete_pieces(r.upper_body().joints) for r in chosen):
+                raise _incomplete(name)
     with tqdm(total=len(jobs), disable=not progress, unit="fit", desc="fits") as bar:
         if workers <= 1 or len(jobs) < 2:
             found = []
@@ -363,10 +369,14 @@ def _pieces(
             joints = place_neck(joints, offset)
         found.append([centred_on_neck(piece) for piece in complete_pieces(joints)])
     if not any(found):
-        raise InputError(
-            f"{name}: no {LEAST_FRAMES} frames in a row have all eight joints; a test needs some"
-        )
+        raise _incomplete(name)
     return found
+
+
+def _incomplete(name: str) -> InputError:
+    return InputError(
+        f"{name}: no {LEAST_FRAMES} frames in a row have all eight joints; a test needs some"
+    )
 
 
 def training_neck(train: Sequence[Recording], kind: str) -> NeckOffset:
