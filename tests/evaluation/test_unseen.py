@@ -1,6 +1,8 @@
 """Fits on some persons scored on others: what is kept, who is refused, what arms do."""
 
+import time
 from dataclasses import replace
+from multiprocessing import active_children
 
 import pytest
 import torch
@@ -131,6 +133,29 @@ def test_processes_find_the_same(persons, tmp_path):
         assert a.keys() == b.keys()
         for name in a:
             torch.testing.assert_close(a[name].filtered, b[name].filtered)
+
+
+def failing_recipe(*_, **__):
+    """A fit that fails while another one is at work."""
+    time.sleep(1)
+    raise InputError("a bad fit")
+
+
+def endless_recipe(*_, **__):
+    """A fit that takes longer than the test."""
+    time.sleep(30)
+
+
+@pytest.mark.slow
+def test_what_ends_the_work_ends_all_processes(persons, tmp_path):
+    """They finished their fits, of minutes, and those in their queue."""
+    jobs = [
+        unseen.Job(name, persons["s1"], {"s2": persons["s2"]}, {}, recipe)
+        for name, recipe in (("a", failing_recipe), ("b", endless_recipe), ("c", endless_recipe))
+    ]
+    with pytest.raises(InputError, match="a bad fit"):
+        unseen.run_jobs(jobs, tmp_path, workers=2)
+    assert not active_children()
 
 
 def test_a_person_of_the_training_set_is_refused(persons, tmp_path):

@@ -7,8 +7,9 @@ depend on, so that a killed run goes on where it stopped and protocols do not fi
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
+from threading import RLock
 from typing import Any, NamedTuple
 
 import torch
@@ -173,9 +174,8 @@ def run_jobs(
 def _run_in_processes(
     jobs: Sequence[Job], folder: Path, workers: int, bar: tqdm
 ) -> list[dict[str, Scored]]:
-    pool = ProcessPoolExecutor(
-        workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
-    )
+    others = active_children()
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker)
     with pool:
         futures = [pool.submit(_run, job, folder, False) for job in jobs]
         try:
@@ -183,9 +183,17 @@ def _run_in_processes(
                 done.result()
                 bar.update(1)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                if process not in others:  # it would finish its fits, and those that wait for it
+                    process.terminate()
+            pool.shutdown(cancel_futures=True)
             raise
         return [future.result() for future in futures]
+
+
+def _start_worker() -> None:
+    torch.set_num_threads(1)
+    tqdm.set_lock(RLock())  # its own, of several processes, is left over where a worker is ended
 
 
 def _run(job: Job, folder: Path, progress: bool) -> dict[str, Scored]:
