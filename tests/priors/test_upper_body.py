@@ -20,7 +20,7 @@ from torchpose.errors import (
     PriorError,
 )
 from torchpose.learning import fit_upper_body_prior
-from torchpose.learning._model_card import model_card, write_model_card
+from torchpose.learning._model_card import card_table, model_card, write_model_card
 from torchpose.learning._samplers import all_samples
 from torchpose.learning._training import arm_sources, collect_poses
 from torchpose.priors import GaussianMixture, UpperBodyPrior, known_priors, load_prior
@@ -305,7 +305,9 @@ def test_model_card_says_what_matters(prior, tmp_path):
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# small\n")
     for part in ("site:set#p1", "MIT", "400", "2,000", "zxy", "kind of neck | neck", "5.0 cm",
-                 "|roll| <= 15°", "`fit`", "2 persons"):  # fmt: skip
+                 "roll -15 to 15°", "`fit`", "2 persons"):  # fmt: skip
         assert part in text
+    assert all(row.count("|") == 3 for row in text.splitlines() if row.startswith("| viewpoints"))
+    assert card_table({"licence": "MIT | mine\nalone"}).endswith(r"| licence | MIT \| mine alone |")
     mixture = prior.left
     assert "not stated" in model_card(UpperBodyPrior(mixture, mixture))

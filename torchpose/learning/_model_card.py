@@ -61,8 +61,13 @@ def card_text(title: str, sections: Mapping[str, str]) -> str:
 
 def card_table(rows: Mapping[str, Any]) -> str:
     """Return a table of names and values, without those that are empty."""
-    lines = [f"| {name} | {value} |" for name, value in rows.items() if value]
+    lines = [f"| {name} | {_cell(value)} |" for name, value in rows.items() if value]
     return "\n".join(["| | |", "|---|---|", *lines])
+
+
+def _cell(value: Any) -> str:
+    """Return a value as it can stand in a table of Markdown."""
+    return " ".join(str(value).splitlines()).replace("|", "\\|")
 
 
 def _description(prior: UpperBodyPrior) -> str:
@@ -185,7 +190,7 @@ def _held_out(prior: UpperBodyPrior) -> str:
     modes = sorted(held_out, key=list(MODES).index)
     persons = sorted(held_out[modes[0]])
     rows = [
-        [person, *(f"{100 * held_out[mode].get(person, math.nan):.1f}" for mode in modes)]
+        [_cell(person), *(f"{100 * held_out[mode].get(person, math.nan):.1f}" for mode in modes)]
         for person in persons
     ]
     values = [[100 * value for value in held_out[mode].values()] for mode in modes]
@@ -222,7 +227,8 @@ def _limits(prior: UpperBodyPrior) -> str:
 def _views(views: Mapping[str, Any]) -> str:
     if not views:
         return "not stated"
-    angles = ", ".join(f"|{a}| <= {math.degrees(views[a]):g}°" for a in ("roll", "pitch", "yaw"))
+    most = {name: math.degrees(views[name]) for name in ("roll", "pitch", "yaw")}
+    angles = ", ".join(f"{name} {-angle:g} to {angle:g}°" for name, angle in most.items())
     shifts = ", ".join(f"{t} {views[t][0]:g} to {views[t][1]:g} m" for t in ("tx", "ty", "tz"))
     return f"{angles}, {shifts}"
 
