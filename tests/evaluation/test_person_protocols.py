@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -356,6 +357,16 @@ def test_recipes_by_name(data, tmp_path):
             learning_curve._imported(text)
     with pytest.raises(InputError, match="9 training persons"):
         learning_curve.run(data, tmp_path, progress=False, counts=(1, 9))
+    with pytest.raises(InputError, match="names of their own, got this recipe, x, x"):
+        learning_curve.run(data, tmp_path, progress=False, compare=("x=math.sin", "x=math.cos"))
+
+
+def test_recipes_in_the_working_folder(tmp_path, monkeypatch):
+    """As documented; the command `torchpose` did not look there."""
+    (tmp_path / "recipe_of_mine.py").write_text("def fit(recordings, **settings): ...")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert learning_curve._imported("mine=recipe_of_mine.fit")[1].__module__ == "recipe_of_mine"
 
 
 def test_data_that_would_not_be_used_are_refused(data, tmp_path):

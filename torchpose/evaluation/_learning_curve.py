@@ -9,7 +9,9 @@ recordings, and scored on the other half.
 Camera and noise are those of `score`. Covariances are not calibrated.
 """
 
+import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from itertools import product
@@ -101,6 +103,10 @@ def run(
         check_count("counts", count)
     out = check_output_folder(out)
     known = list(recipes or [("this recipe", fit_kinect_prior), *map(_imported, compare)])
+    if len(dict(known)) < len(known):
+        raise InputError(
+            f"recipes need names of their own, got {', '.join(name for name, _ in known)}; rename some"
+        )
     persons, others, counts, notes = _read(data, more, counts, quick)
     if quick:
         n_subsets, n_own = 2, min(1, n_own)
@@ -173,7 +179,9 @@ def halves(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
 
 
 def _imported(text: str) -> tuple[str, Recipe]:
-    """Return NAME=module.function as name and function."""
+    """Return NAME=module.function as name and function; modules may be in the working folder."""
+    if os.getcwd() not in sys.path:  # `python -m` has it, and the command `torchpose` has not
+        sys.path.append(os.getcwd())
     match = re.fullmatch(r"(.+)=([\w.]+)\.(\w+)", text)
     try:
         if match is not None:
