@@ -5,6 +5,7 @@ import math
 import shutil
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from torchpose.evaluation import _unseen as unseen
 from torchpose.evaluation._learning_curve import cyclic_subsets, halves
 from torchpose.evaluation._person_recordings import POSE_CLASSES
 from torchpose.evaluation._person_tables import mean_error
+from torchpose.evaluation._trials import _version_of
 from torchpose.io import read_recordings
 from torchpose.priors import load_prior
 from torchpose.skeleton import SKELETONS, UPPER_BODY
@@ -367,6 +369,17 @@ def test_recipes_in_the_working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert learning_curve._imported("mine=recipe_of_mine.fit")[1].__module__ == "recipe_of_mine"
+
+
+def test_a_recipe_that_was_edited_is_another_one(tmp_path, monkeypatch):
+    """Priors of the text before were taken for its own."""
+    monkeypatch.syspath_prepend(tmp_path)
+    file, found = tmp_path / "edited_recipe.py", []
+    for text in ("", "", "1  # tuned", "VERSION = 7", "VERSION = 7  # more"):
+        file.write_text(f"{text}\ndef fit(recordings): ...\n")
+        sys.modules.pop("edited_recipe", None)
+        found.append(_version_of(import_module("edited_recipe").fit))
+    assert found[0] == found[1] != found[2] and found[3:] == ["7", "7"]
 
 
 def test_data_that_would_not_be_used_are_refused(data, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -55,16 +56,14 @@ def cached_prior(
 ) -> UpperBodyPrior:
     """Fit a prior, or read it from `out` if the same one was fitted there before.
 
-    The file's name holds a hash of the recipe's name and version (`VERSION` of its module, else that
-    of torchpose), of the settings, and of all that the recordings hold.
+    The file's name holds a hash of the recipe's name and version (`VERSION` of its module, else the
+    module's text and the version of torchpose), of the settings, and of all that the recordings hold.
 
     Args:
         out: folder. recordings: to fit to. recipe: see `Recipe`. progress: whether to show bars.
         settings: handed to the recipe.
     """
-    module = import_module(recipe.__module__)
-    version = getattr(module, "VERSION", "") or package_version()
-    facts: list[Any] = [recipe.__module__, recipe.__qualname__, str(version), settings]
+    facts: list[Any] = [recipe.__module__, recipe.__qualname__, _version_of(recipe), settings]
     facts.append(fingerprint(recordings))
     path = out / f"prior-{settings_hash(facts)}.safetensors"
     if path.is_file():
@@ -75,6 +74,18 @@ def cached_prior(
     prior = recipe(recordings, progress=progress, **settings)
     prior.save(path)
     return prior
+
+
+def _version_of(recipe: Recipe) -> str:
+    """Return what changes with a recipe."""
+    module = import_module(recipe.__module__)
+    given = str(getattr(module, "VERSION", ""))
+    if given:
+        return given
+    try:
+        return f"{package_version()} {inspect.getsource(module)}"
+    except (OSError, TypeError):  # typed into a console
+        return package_version()
 
 
 def settings_hash(facts: Sequence[Any]) -> str:
