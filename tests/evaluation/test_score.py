@@ -41,6 +41,7 @@ def scored(folder, prior, tmp_path_factory):
 def test_errors_are_those_of_the_tracker_and_of_the_mean_pose(folder, prior, scored) -> None:
     report, _ = scored
     assert list(report["persons"].rows)[:2] == ["b", "c"]
+    assert report.settings["method"] == "default (mkf-fixed)"
     still = []
     for recording in read_recordings([folder / f"{person}_a01_t0.npz" for person in "bc"]):
         test = make_test_set(poses_to_score([recording], prior, None), CAMERA, 30.0, 4, 2.0)

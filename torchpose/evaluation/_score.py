@@ -103,7 +103,8 @@ def run(
     prior = load_prior("kinect-upper-body") if prior is None else prior
     recordings, notes = read_known_persons(data)
     scored = {r.person_id for r in recordings}
-    in_arms = _known_to_arms(scored, method or _usual(prior, _SEEN[joints]))
+    usual = _usual(prior, _SEEN[joints])
+    in_arms = _known_to_arms(scored, method or usual)
     known = sorted(scored & {*prior.info.persons, *in_arms})
     if not seen:
         prior.check_unseen(scored)
@@ -113,7 +114,7 @@ def run(
     for name, group in tqdm(persons.items(), disable=not progress, unit="person", desc="score"):
         found[name] = _score(prior, name, group, method, _SEEN[joints], noise_std, seed)
     report = Report("A prior and a tracker on recordings", {
-        "prior": prior.info.name, "method": method or "default", "joints": joints, "seed": seed,
+        "prior": prior.info.name, "method": method or f"default ({usual})", "joints": joints, "seed": seed,
         "noise_std": noise_std, "every": every, "persons the prior was fitted on": known,
         "persons": {name: counted(len(group), "recording") for name, group in persons.items()},
     })  # fmt: skip
