@@ -1,8 +1,10 @@
 """Fits on some persons scored on others: what is kept, who is refused, what arms do."""
 
+import pickle
 import time
 from dataclasses import replace
 from multiprocessing import active_children
+from multiprocessing.reduction import ForkingPickler
 
 import pytest
 import torch
@@ -133,6 +135,14 @@ def test_processes_find_the_same(persons, tmp_path):
         assert a.keys() == b.keys()
         for name in a:
             torch.testing.assert_close(a[name].filtered, b[name].filtered)
+
+
+def test_jobs_are_sent_without_open_files(persons):
+    """A thousand recordings were too many."""
+    job = unseen.Job("a", persons["s1"], {}, {}, small_recipe)
+    sent = bytes(ForkingPickler.dumps(unseen.AsBytes(job)))
+    assert len(sent) > sum(r.joints.nbytes for r in persons["s1"])
+    assert torch.equal(pickle.loads(sent).train[0].joints, persons["s1"][0].joints)
 
 
 def failing_recipe(*_, **__):

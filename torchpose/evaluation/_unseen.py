@@ -4,7 +4,8 @@ A `Job` is a fit and the persons it is scored on. Priors and scores are kept in 
 depend on, so that a killed run goes on where it stopped and protocols do not fit the same twice.
 """
 
-from collections.abc import Mapping, Sequence
+import pickle
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from multiprocessing import active_children, get_context
@@ -177,7 +178,7 @@ def _run_in_processes(
     others = active_children()
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker)
     with pool:
-        futures = [pool.submit(_run, job, folder, False) for job in jobs]
+        futures = [pool.submit(_run_there, AsBytes(job), folder) for job in jobs]
         try:
             for done in as_completed(futures):
                 done.result()
@@ -188,12 +189,30 @@ def _run_in_processes(
                     process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
-        return [future.result() for future in futures]
+        return [pickle.loads(future.result()) for future in futures]
+
+
+class AsBytes:
+    """Becomes the value that it holds in another process, which gets it as bytes.
+
+    As they are, tensors are sent as open files, one each, of which a process may have a thousand.
+    """
+
+    def __init__(self, value: Any) -> None:
+        self._value = value
+
+    def __reduce__(self) -> tuple[Callable[[bytes], Any], tuple[bytes]]:
+        return pickle.loads, (pickle.dumps(self._value),)
 
 
 def _start_worker() -> None:
     torch.set_num_threads(1)
     tqdm.set_lock(RLock())  # its own, of several processes, is left over where a worker is ended
+
+
+def _run_there(job: Any, folder: Path) -> bytes:
+    """Run a job, sent by `AsBytes`, in a process of its own; return its scores as bytes, too."""
+    return pickle.dumps(_run(job, folder, False))
 
 
 def _run(job: Job, folder: Path, progress: bool) -> dict[str, Scored]:
