@@ -305,7 +305,7 @@ def test_model_card_says_what_matters(prior, tmp_path):
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# small\n")
     for part in ("site:set#p1", "MIT", "400", "2,000", "zxy", "kind of neck | neck", "5.0 cm",
-                 "roll -15 to 15°", "`fit`", "2 persons"):  # fmt: skip
+                 "roll ±15°", "`fit`", "2 persons"):  # fmt: skip
         assert part in text
     assert all(row.count("|") == 3 for row in text.splitlines() if row.startswith("| viewpoints"))
     assert card_table({"licence": "MIT | mine\nalone"}).endswith(r"| licence | MIT \| mine alone |")

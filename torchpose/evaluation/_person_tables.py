@@ -13,6 +13,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 SHORT_NAMES = tuple(name.replace("_left", " L").replace("_right", " R") for name in UPPER_BODY)
 """Names of the joints at the heads of columns."""
 
+_COLUMNS = ("filtered", "smoothed", "in 50 %", "in 90 %", "log-lik.")
 _HANDS, _ELBOWS = (0, 7), (1, 6)
 
 
@@ -28,16 +29,7 @@ def add_persons(report: Report, persons: Mapping[str, Scored]) -> Table:
         "persons",
         "3D error after Procrustes (cm), true joints inside the ellipsoids (%), log-likelihood of "
         "the pose (nats)",
-        [
-            "frames",
-            "mean pose",
-            "filtered",
-            "smoothed",
-            "in 50 %",
-            "in 90 %",
-            "log-lik.",
-            *SHORT_NAMES,
-        ],
+        ["frames", "mean pose", *_COLUMNS, *SHORT_NAMES],
         digits=(0, 2, 2, 2, 0, 0, 2, *[1] * 8),
         note="The mean pose is that of the prior. Joints: filtered. Ellipsoids: of the filter. Mean and "
         "standard deviation are over persons, each counting once; 'all frames' counts every frame once.",

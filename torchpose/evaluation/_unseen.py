@@ -244,14 +244,8 @@ def _scored_at(
     progress: bool,
 ) -> Scored:
     """Return the scores of sequences at one frame rate, read from the folder if they are there."""
-    facts = [
-        "scores 2",
-        package_version(),
-        repr(job.test),
-        fps,
-        *prior.state_dict().values(),
-        *poses,
-    ]
+    facts = ["scores 2", package_version(), repr(job.test), fps]
+    facts += [*prior.state_dict().values(), *poses]
     path = folder / f"scores-{settings_hash(facts)}.npz"
     found: Scored | None = read_kept(path, Scored, Scored._fields)
     if found is None:

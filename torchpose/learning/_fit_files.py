@@ -16,9 +16,7 @@ from torchpose.learning._recipes.manifold import ManifoldFitting
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 _SHOWN = 3  # persons
-_NO_NAME = re.compile(
-    r'[/\\:*?"<>|\x00-\x1f]'
-)  # what names of files hold nowhere, or not on Windows
+_NO_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')  # not in names of files, at least on Windows
 
 
 def check_fit_file(name: str | Path) -> Path:

@@ -227,8 +227,7 @@ def _limits(prior: UpperBodyPrior) -> str:
 def _views(views: Mapping[str, Any]) -> str:
     if not views:
         return "not stated"
-    most = {name: math.degrees(views[name]) for name in ("roll", "pitch", "yaw")}
-    angles = ", ".join(f"{name} {-angle:g} to {angle:g}°" for name, angle in most.items())
+    angles = ", ".join(f"{a} ±{math.degrees(views[a]):g}°" for a in ("roll", "pitch", "yaw"))
     shifts = ", ".join(f"{t} {views[t][0]:g} to {views[t][1]:g} m" for t in ("tx", "ty", "tz"))
     return f"{angles}, {shifts}"
 
