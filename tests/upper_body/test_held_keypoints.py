@@ -70,12 +70,13 @@ def test_arms_are_held_as_a_loop_holds_them(share):
         np.testing.assert_array_equal(ours[1], there)
 
 
+@pytest.mark.parametrize("rate", [RATE, 20.0])  # 20 times 1 / 20 is more than a second, by rounding
 @pytest.mark.parametrize("sizes", [(1,) * 80, (7, 1, 40, 32)])
-def test_blocks_of_frames_are_held_as_the_whole(sizes):
-    measured, last, parts = walks(), None, []
-    whole = hold_hidden(measured, None, RATE)
+def test_blocks_of_frames_are_held_as_the_whole(sizes, rate):
+    measured, last, parts = walks(share=0.3), None, []
+    whole = hold_hidden(measured, None, rate)
     for block in zip(*(x.split(sizes, 1) for x in measured[:3]), strict=True):
-        held = hold_hidden(MeasuredJoints(*block), last, RATE)
+        held = hold_hidden(MeasuredJoints(*block), last, rate)
         last = held.last
         parts.append(held)
     for name in ("uv", "mask", "cov"):

@@ -13,7 +13,7 @@ from torchpose._core.rows import in_frames, last_known, where_rows
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._measured_joints import MeasuredJoints
 
-_LONGEST = 1.0  # seconds
+_LONGEST = 1.0 + 1e-6  # seconds; those of frames, added up, may be more by rounding
 _NOISE = 9.0  # factor on R
 # Metres per second along every axis, of shoulders, elbows and hands that are hidden, and seconds after which
 # the standard deviation of how far they have moved grows no more.
