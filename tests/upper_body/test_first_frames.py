@@ -111,3 +111,30 @@ def test_bodies_that_never_fit_start_for_half_a_second(monkeypatch):
     found = tracker(outliers=False)(uv[None]).joints3d
     assert len(starts) == 6
     assert bool(found.isfinite().all())
+
+
+def late(uv, count, n_frames):
+    """Return keypoints of a body that comes after so many empty frames."""
+    return torch.cat([torch.full_like(uv[:1].expand(count, -1, -1), torch.nan), uv])[:n_frames]
+
+
+def test_bodies_that_come_late_are_tracked_from_their_first_frame():
+    uv = pixels(spread_arms(24), 2.0)
+    found = tracker()(torch.stack([late(uv, count, 24) for count in (0, 1, 2, 3)])).joints3d
+    for count in (1, 2, 3):  # a torso is updated in every third frame
+        off = (found[count, count:] - found[0, : 24 - count]).norm(dim=-1)
+        assert float(off.max()) < 0.05
+    for count, together in enumerate(found):
+        alone = tracker()(late(uv, count, 24)[None]).joints3d[0]
+        torch.testing.assert_close(together, alone, rtol=0, atol=1e-7)
+
+
+def test_a_stream_finds_who_comes_late_as_the_whole_recording_does():
+    uv = late(pixels(spread_arms(9), 2.0), 3, 9)
+    others = [row for name, row in ROW.items() if name not in ("head", "neck", "hand_left")]
+    uv[:, others], uv[:5, ROW["neck"]] = torch.nan, torch.nan  # one joint of the torso, then two
+    whole, live = tracker()(uv[None]).joints3d, tracker()
+    state = live.init(1)
+    for t, frame in enumerate(uv):
+        state, pose = live.step(state, frame[None])
+        torch.testing.assert_close(pose.joints3d, whole[:, t], rtol=0, atol=1e-9)

@@ -107,9 +107,10 @@ class ArticulatedState(NamedTuple):
         lean: the moments of the line between the shoulders (`seen_lean`), [B, 2]. tilt: the roll of the
             axes in which it is level, [B, 3, 3].
         frame: the number of frames before.
-        starts: the number of updates at which a body may still start, [B]; None if 0 for everybody. It starts
-            where an elbow or hand is seen beside two joints of the torso, since one joint has no size in the
-            image, and so no depth that arms could rule out; and starts again until the frame fits a body.
+        starts: the number of updates at which a body may still start, [B], one more before two joints of its
+            torso are seen; None if 0 for everybody. It starts where an elbow or hand is seen beside these,
+            since one joint has no size in the image, and so no depth that arms could rule out; and starts
+            again until the frame fits a body.
         told: what the pose of the last frame holds of torso and lengths; None before the first, and after
             several frames at a time.
         memory: what the network remembers that lifts bones, [B, L, W]; None before the first frame, and
@@ -261,7 +262,7 @@ class ArticulatedFilter(Estimator):
             middle=root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1),
             tilt=roll(lean_angle(begun["lean"])),
             frame=0,
-            starts=torch.full((batch_size,), self.starts, device=root.device),
+            starts=torch.full((batch_size,), self.starts + 1, device=root.device),
         )
 
     def _before_any_frame(self, batch_size: int) -> dict[str, Any]:
@@ -353,20 +354,33 @@ class ArticulatedFilter(Estimator):
         rays = as_rays(measured, self.optics, bones, held.moved)
         facts = facts_of(rays, measured, self.optics.matrix)
         frames, batch_size = split(rays), len(measured.uv)
+        sights = self._first_sights(state, rays.torso)
         with tqdm(total=len(frames), disable=not progress, desc="frames") as bar:
-            for run in self._runs(state.frame, facts, batch_size):
+            for run in self._runs(state.frame, facts, batch_size, sights):
                 for step in self._run(state, frames[run], facts[run.start]):
                     state = step.state
                     yield step
                 bar.update(run.stop - run.start)
 
-    def _runs(self, frame: int, facts: Sequence[Facts], batch_size: int) -> list[slice]:
+    def _first_sights(
+        self, state: ArticulatedState, torso: Bool[Tensor, "B T 4"]
+    ) -> Sequence[bool]:
+        """Return in which of T frames two joints of anybody's torso are seen for the first time."""
+        if state.starts is None:
+            return [False] * torso.shape[1]
+        two = (torso.sum(-1) > 1) & (state.starts > self.starts)[:, None]
+        return (two & (two.cumsum(1) == 1)).any(0).tolist()
+
+    def _runs(
+        self, frame: int, facts: Sequence[Facts], batch_size: int, sights: Sequence[bool]
+    ) -> list[slice]:
         """Return frames in a row of which the same holds, and in which only the first one changes the torso.
 
         A frame that the lengths of bones are learnt from, or that has no place of its own, stands alone.
 
         Args:
             frame: the number of the first one. facts: what holds for each. batch_size: B.
+            sights: in which of them a torso is seen for the first time.
         """
         runs = [slice(0, 1)]
         for t in range(1, len(facts)):
@@ -374,7 +388,7 @@ class ArticulatedFilter(Estimator):
             learns = now % self.stride == 0 or (now - 1) % self.stride == 0
             alike = facts[t].placed and facts[t].alike(facts[first])
             full = (t - first) * batch_size >= _BODIES_AT_ONCE
-            if learns or now % self.every == 0 or not alike or full:
+            if learns or now % self.every == 0 or sights[t] or not alike or full:
                 runs.append(slice(t, t + 1))
             else:
                 runs[-1] = slice(first, t + 1)
@@ -389,14 +403,16 @@ class ArticulatedFilter(Estimator):
             state: the state before the frames. frames: their measurements. facts: what holds for them.
         """
         due = state.roots is None or state.frame % self.every == 0
-        fresh, again = self._starting(state, frames[0]) if due else (None, None)
+        first, fresh, again = self._starting(state, frames[0], due)
         if again is not None:
             state = self._without_past(state, again)
         state, before = self._leaning(state, frames[0], facts), state.moments
         tilted = upright(frames[0], facts, state.tilt)
         last = None if facts.placed else (state.middle[:, None] @ state.tilt)[:, 0]
         if due:
-            state = self._with_torso(state, tilted, last, fresh)
+            state = self._with_torso(state, tilted, last, first, fresh)
+        elif first is not None:
+            state = _of_some(first, self._with_torso(state, tilted, last, first, fresh), state)
         roots = state.roots
         if roots is None:
             raise RuntimeError("the first frame is one that changes the torso")
@@ -459,21 +475,26 @@ class ArticulatedFilter(Estimator):
         state: ArticulatedState,
         frame: UprightFrame,
         last: Float[Tensor, "B 3"] | None,
+        first: Bool[Tensor, " B"] | None,
         fresh: Bool[Tensor, " B"] | None,
     ) -> ArticulatedState:
         """Return the state after an update of the torso: hypotheses of the root near the likeliest.
 
         Args:
             state: the state before. frame: the measurements. last: as in `RootStep.weigh`.
-            fresh: which bodies start with this frame; None is nobody.
+            first, fresh: which torsos are seen for the first time, and which bodies start with this frame;
+                None is nobody.
         """
         power = torch.full_like(state.middle[:, 0], 1.0 if state.roots is None else self.power)
-        power = power if fresh is None else power.masked_fill(fresh, 1.0)
+        for whole in (first, fresh):
+            power = power if whole is None else power.masked_fill(whole, 1.0)
         size, farther = follow_size(state.seen_size, frame.torso, self.every / self.model.rate)
         belief, roots, fits = self.root.weigh(
             state.root, frame, last, state.sizes, power, fresh, _none_if_nobody(farther)
         )
         starts = state.starts
+        if starts is not None and first is not None:
+            starts = starts.masked_fill(first, self.starts)
         if starts is not None and fresh is not None and fits is not None:
             left = (starts - 1).masked_fill(fits, 0)
             starts = _none_if_nobody(torch.where(fresh, left, starts))
@@ -483,14 +504,24 @@ class ArticulatedFilter(Estimator):
         )
 
     def _starting(
-        self, state: ArticulatedState, frame: RayFrame
-    ) -> tuple[Bool[Tensor, " B"] | None, Bool[Tensor, " B"] | None]:
-        """Return which bodies start with this frame, and which of them start again; None is nobody."""
+        self, state: ArticulatedState, frame: RayFrame, due: bool
+    ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        """Return which torsos are seen for the first time, and which bodies start, and start again.
+
+        Args:
+            state: the state before. frame: the measurements. due: whether it is time for an update of all.
+
+        Returns:
+            Three times which of the bodies, [B]; None is nobody.
+        """
         if state.starts is None:
-            return None, None
-        there = frame.limbs.flatten(1).any(1) & (frame.torso.sum(1) > 1)
-        fresh = there & (state.starts > 0)
-        return _none_if_nobody(fresh), _none_if_nobody(fresh & (state.starts < self.starts))
+            return None, None, None
+        two = frame.torso.sum(1) > 1
+        first = two & (state.starts > self.starts)
+        fresh = two & frame.limbs.flatten(1).any(1) & (state.starts > 0)
+        fresh = fresh if due else fresh & first
+        again = fresh & (state.starts < self.starts)
+        return _none_if_nobody(first), _none_if_nobody(fresh), _none_if_nobody(again)
 
     def _without_past(
         self, state: ArticulatedState, chosen: Bool[Tensor, " B"]
@@ -556,6 +587,15 @@ class ArticulatedFilter(Estimator):
         return estimates_of(
             poses, len(measured.uv), self.optics.matrix, self.lengths.names, measured
         )
+
+
+def _of_some(
+    chosen: Bool[Tensor, " B"], new: ArticulatedState, old: ArticulatedState
+) -> ArticulatedState:
+    """Return the state in which an update of the torso is that of the chosen bodies alone."""
+    names = ("root", "roots", "seen_size", "moments")
+    fields = {name: where_rows(chosen, getattr(new, name), getattr(old, name)) for name in names}
+    return new._replace(**fields)
 
 
 def _none_if_nobody(chosen: Tensor) -> Tensor | None:
