@@ -321,6 +321,16 @@ def test_visibility_of_arrays_is_the_confidence_where_there_is_none(tmp_path):
         assert read.confidence.unique().tolist() == [expected]
 
 
+def test_joints_that_were_inferred_are_no_keypoints(tmp_path):
+    observed = np.random.default_rng(1).uniform(size=(5, 3)) < 0.6
+    poses = {"keypoints": None, "joints2d": points(), "joints3d": np.zeros((5, 3, 3))}
+    read = read_keypoints(write(tmp_path / "poses.npz", **poses, observed=observed))
+    assert read.measured.tolist() == observed.tolist()
+    assert "tracked before" in read.notes[0]
+    read = read_keypoints(write(tmp_path / "landmarks.npz", **poses))  # as MediaPipe's
+    assert bool(read.measured.all()) and not read.notes
+
+
 @pytest.mark.parametrize(
     ("lines", "word"),
     [

@@ -47,6 +47,10 @@ _SPELLINGS = (  # of columns, in place of NAME_x
 )
 _DEEPLABCUT = {"scorer", "individuals", "bodyparts", "coords"}  # first cells of its header
 _OF_SEVERAL_CAMERAS = {"point_id", "img_loc_x", "img_loc_y"}
+_TRACKED = (
+    "the keypoints are poses that were tracked before: joints that were not measured there are missing, and "
+    "noise is filtered out twice; give the keypoints of the detector instead"
+)
 _NEGATIVE = 0.2  # share of coordinates; pixels are hardly negative
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 
@@ -113,14 +117,25 @@ def read_npz_keypoints(path: Path) -> RawKeypoints:
     landmarks = "keypoints" not in there and "joints2d" in there
     points, trust = ("joints2d", _TRUST[::-1]) if landmarks else ("keypoints", _TRUST)
     seen = trust[0] if trust[0] in there else trust[1]
-    arrays = read_npz(path, (points, "names"), (seen, "fps", "K", "image_size", "neck"))
+    tracked = landmarks and {"observed", "joints3d"} <= {*there}
+    further = (seen, "fps", "K", "image_size", "neck", *["observed"] * tracked)
+    arrays = read_npz(path, (points, "names"), further)
     given = {key: numbers(f"{path}: {key}", arrays[key])
              for key in (points, seen, "K", "image_size") if key in arrays}  # fmt: skip
+    notes: tuple[str, ...] = ()
+    observed = arrays.get("observed")
+    if (
+        observed is not None
+        and observed.dtype == bool
+        and observed.shape == given[points].shape[:-1]
+    ):
+        given[points] = np.where(observed[..., None], given[points], np.nan)
+        notes = (_TRACKED,)
     neck = one_text(path, "neck", arrays["neck"]) if "neck" in arrays else ""
     return RawKeypoints(
         given[points], texts(path, "names", arrays["names"]), given.get(seen),
         one_number(path, "fps", arrays["fps"]) if "fps" in arrays else None,
-        given.get("K"), given.get("image_size"), neck or None,
+        given.get("K"), given.get("image_size"), neck or None, notes=notes,
     )  # fmt: skip
 
 
