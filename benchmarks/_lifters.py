@@ -22,11 +22,12 @@ from tqdm.auto import tqdm
 
 from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import LENGTHS, ArmPrior
-from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
+from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, mirror_pose
 
 __all__ = [
     "FEW",
     "LIFTERS",
+    "ArmExamples",
     "Lifter",
     "Recurrent",
     "draw_pieces",
@@ -45,6 +46,7 @@ _TURN, _TILT, _ANY = math.radians(15.0), math.radians(8.0), 0.3
 _DEPTH, _DEPTH_STD, _NEAREST = 2.6, 0.4, 0.9
 _NOISE = 3.0 / 525.0  # of a pixel over the focal length
 FEW = (False, False, True)  # of shoulder, elbow and hand
+_ARMS = [list(LEFT_ARM[2::-1]), list(RIGHT_ARM[2::-1])]  # shoulder, elbow and hand
 
 
 class Lifter(NamedTuple):
@@ -177,8 +179,13 @@ def draw_pieces(
         yield i, (first + torch.arange(frames)).clamp_max(lengths[i] - 1)
 
 
-class _Examples:
-    """Draws of features and bones: sequences of arms in random cameras."""
+class ArmExamples:
+    """Draws of arms in random cameras.
+
+    Args:
+        sets: share and joints [T, 8, 3] of each set. arms: whose lengths of bones are taken.
+        hand: "hand" or "wrist", where forearms end. generator: of random numbers.
+    """
 
     def __init__(
         self,
@@ -188,13 +195,8 @@ class _Examples:
         generator: torch.Generator,
     ) -> None:
         self.generator = generator
-        rows = list(LEFT_ARM[2::-1]), list(RIGHT_ARM[2::-1])
-        pools = [
-            [torch.stack([joints[:, row].float() for row in rows], 1) for joints in found]
-            for _, found in sets
-        ]
-        self.pool = [sequence for pool in pools for sequence in pool]
-        lengths = [torch.tensor([float(len(x)) for x in pool]) for pool in pools]
+        self.pool = [joints.float() for _, found in sets for joints in found]
+        lengths = [torch.tensor([float(len(x)) for x in found]) for _, found in sets]
         self.weight = torch.cat(
             [share * n / n.sum() for (share, _), n in zip(sets, lengths, strict=True)]
         )
@@ -202,52 +204,67 @@ class _Examples:
         chosen = [LENGTHS.index(name) for name in ("upper_arm", forearm, "shoulder_width")]
         self.lengths, self.spread = arms.lengths[chosen].float(), arms.spread[chosen].float()
 
-    def __call__(self, frames: int, count: int) -> tuple[Tensor, Tensor]:
-        """Return features [count, frames, F] and bones [count, frames, 12] in units of `_TARGET`."""
-        arms = self._mirrored(self._drawn(frames, count))
-        scale = (self.spread.min() * self._normal(count, 1)).exp()
-        own = (self.spread.square() - self.spread.min().square()).sqrt() * self._normal(count, 3)
+    def bodies(self, frames: int, count: int) -> tuple[Tensor, Tensor]:
+        """Return joints [N, T, 8, 3] and bones [N, T, 2, 2, 3], turned, metres.
+
+        Joints are relative to the middle of the shoulders. Head and neck are as far away, in shoulder
+        widths, as they were recorded.
+        """
+        joints = self._mirrored(self._drawn(frames, count))
+        arms = joints[:, :, _ARMS]
+        scale = (self.spread.min() * self.normal(count, 1)).exp()
+        own = (self.spread.square() - self.spread.min().square()).sqrt() * self.normal(count, 3)
         sizes = self.lengths * scale * own.exp()
-        shoulders = arms[:, :, :, 0] - arms[:, :, :, 0].mean(2, keepdim=True)
+        joints = joints - arms[:, :, :, :1].mean(2)
         width = (arms[:, :, 0, 0] - arms[:, :, 1, 0]).norm(dim=-1).median(1).values
-        shoulders = shoulders * (sizes[:, 2] / width.clamp_min(0.05))[:, None, None, None]
+        joints = joints * (sizes[:, 2] / width.clamp_min(0.05))[:, None, None, None]
         bones = normalize(arms.diff(dim=3), dim=-1) * sizes[:, None, None, :2, None]
         turn = self._turns(count)
-        shoulders, bones = (torch.einsum("nij,n...j->n...i", turn, x) for x in (shoulders, bones))
-        depth = (_DEPTH * (_DEPTH_STD * self._normal(count)).exp()).clamp_min(_NEAREST)
-        aside = 0.2 * self._normal(count, 2)
-        place = torch.cat([aside, torch.ones(count, 1)], 1) * depth[:, None]
-        start = shoulders + place[:, None, None]
-        ends = torch.cat([start[..., None, :], start[..., None, :] + bones.cumsum(3)], 3)
-        neck = start.mean(2) + 0.015 * self._normal(count, 1, 3)
-        rays, middle = (x[..., :2] / x[..., 2:].clamp_min(0.2) for x in (ends, neck))
-        rays, middle = (x + _NOISE * self._normal(*x.shape) for x in (rays, middle))
-        all_given = torch.rand(count, 1, generator=self.generator) < 0.5
-        given = all_given | torch.tensor(FEW)
-        return _features(rays, middle, given), bones.flatten(2) / _TARGET
+        joints, bones = (torch.einsum("nij,n...j->n...i", turn, x) for x in (joints, bones))
+        ends = joints[:, :, _ARMS][:, :, :, :1] + bones.cumsum(3)
+        joints[:, :, [rows[1:] for rows in _ARMS]] = ends
+        return joints, bones
 
-    def _normal(self, *shape: int) -> Tensor:
+    def normal(self, *shape: int) -> Tensor:
+        """Return normal random numbers."""
         return torch.randn(*shape, generator=self.generator)
 
-    def _drawn(self, frames: int, count: int) -> Float[Tensor, "N T 2 3 3"]:
-        """Return arms of random pieces of the recordings."""
+    def _drawn(self, frames: int, count: int) -> Float[Tensor, "N T 8 3"]:
+        """Return the joints of random pieces of the recordings."""
         lengths = [len(sequence) for sequence in self.pool]
         pieces = draw_pieces(self.weight, lengths, frames, count, self.generator)
         return torch.stack([self.pool[i][rows] for i, rows in pieces])
 
-    def _mirrored(self, arms: Float[Tensor, "N T 2 3 3"]) -> Float[Tensor, "N T 2 3 3"]:
-        """Return the arms, every second time as a mirror has them."""
-        flip = torch.rand(len(arms), generator=self.generator) < 0.5
-        other = arms.flip(2) * torch.tensor([-1.0, 1.0, 1.0])
-        return torch.where(flip[:, None, None, None, None], other, arms)
+    def _mirrored(self, joints: Float[Tensor, "N T 8 3"]) -> Float[Tensor, "N T 8 3"]:
+        """Return the joints, every second time as a mirror has them."""
+        flip = torch.rand(len(joints), generator=self.generator) < 0.5
+        return torch.where(flip[:, None, None, None], mirror_pose(joints), joints)
 
     def _turns(self, count: int) -> Float[Tensor, "N 3 3"]:
         """Return rotations: about the vertical, then two tilts."""
         anyhow = (2 * torch.rand(count, generator=self.generator) - 1) * math.pi
         often = torch.rand(count, generator=self.generator) < _ANY
-        turn = torch.where(often, anyhow, _TURN * self._normal(count))
-        tilts = _TILT * self._normal(2, count)
+        turn = torch.where(often, anyhow, _TURN * self.normal(count))
+        tilts = _TILT * self.normal(2, count)
         return euler_to_matrix(torch.stack([*tilts, turn], -1), "zxy")
+
+
+class _Examples(ArmExamples):
+    """Draws of features and bones: sequences of arms in random cameras."""
+
+    def __call__(self, frames: int, count: int) -> tuple[Tensor, Tensor]:
+        """Return features [count, frames, F] and bones [count, frames, 12] in units of `_TARGET`."""
+        joints, bones = self.bodies(frames, count)
+        depth = (_DEPTH * (_DEPTH_STD * self.normal(count)).exp()).clamp_min(_NEAREST)
+        aside = 0.2 * self.normal(count, 2)
+        place = torch.cat([aside, torch.ones(count, 1)], 1) * depth[:, None]
+        ends = joints[:, :, _ARMS] + place[:, None, None, None]
+        neck = ends[:, :, :, 0].mean(2) + 0.015 * self.normal(count, 1, 3)
+        rays, middle = (x[..., :2] / x[..., 2:].clamp_min(0.2) for x in (ends, neck))
+        rays, middle = (x + _NOISE * self.normal(*x.shape) for x in (rays, middle))
+        all_given = torch.rand(count, 1, generator=self.generator) < 0.5
+        given = all_given | torch.tensor(FEW)
+        return _features(rays, middle, given), bones.flatten(2) / _TARGET
 
 
 def _features(

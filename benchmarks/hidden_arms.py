@@ -171,7 +171,9 @@ def add_rows(table: Table, name: str, unseen: Unseen, method: str, smoothed: boo
         table: of all sets. name: of the set, or of persons in it. unseen: its recordings, and priors that do
             not know them. method: of the tracker. smoothed: whether it knows all later frames.
     """
-    options = bones.trackers(unseen.arms)[method] | {"smoothing": "full" if smoothed else None}
+    options = bones.trackers(unseen.arms, unseen.network)[method] | {
+        "smoothing": "full" if smoothed else None
+    }
     for kind in KINDS:
         rows = []
         for number, view in enumerate(unseen.views):

@@ -53,7 +53,10 @@ def distances(unseen: Unseen, method: str, few: bool, every: int) -> Distances:
         unseen: a set that is left out. method: its name. few: whether neck, hands and head alone are
             measured. every: one recording in so many.
     """
-    options, chosen = bones.trackers(unseen.arms)[method], unseen.few if few else None
+    options, chosen = (
+        bones.trackers(unseen.arms, unseen.network)[method],
+        unseen.few if few else None,
+    )
     found = []
     for view in unseen.views[::every]:
         poses = bones.poses_of(view, unseen.prior, chosen, **options)

@@ -1,7 +1,8 @@
 """Arms of persons of a data set that is left out of every fit, beside learned lifters.
 
-Each of four sets in turn is left out of the prior over arms (`bones.SETS`), of the tracker's prior (the other
-Kinect sets; for Berkeley MHAD the one that comes with torchpose) and of the lifters (`_lifters`). Its
+Each of four sets in turn is left out of the prior over arms (`bones.SETS`), of the network that lifts arms
+(`arm_lifter`), of the tracker's prior (the other Kinect sets; for Berkeley MHAD the one that comes with
+torchpose) and of the lifters (`_lifters`). Its
 recordings are seen by one camera with 3 px of noise; the error is that of `bones`: the vector from the
 shoulder to the wrist (or hand) and to the elbow, camera axes, nothing aligned.
 
@@ -18,19 +19,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 import torchpose
-from benchmarks import bones
+from benchmarks import arm_lifter, bones
 from benchmarks._command import run_command
 from benchmarks._lifters import FEW, LIFTERS, Lifter, fit_lifter
 from benchmarks._table_file import TableFile, print_tables
 from torchpose.evaluation import Report
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
+from torchpose.priors._arm_lifter import ArmLifter, shipped_arm_lifter
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
-from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
-from torchpose.skeleton._torso import KINECT_NECK
+from torchpose.skeleton._joint_sets import canonical_names
 
 _MHAD = "mocap_berkeley_mhad"
 _KINECT = {"kinect_utd_mhad": 24, "burke_kinect/kinect_joints.npz": 1, "kinect_laban": 1}
@@ -38,10 +38,7 @@ _KINECT = {"kinect_utd_mhad": 24, "burke_kinect/kinect_joints.npz": 1, "kinect_l
 NAMES = (*_KINECT, _MHAD)
 """Sets that are left out in turn."""
 _ONE = "burke_kinect/kinect_joints.npz"  # that lifters of a quick run know
-_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
-_SHOULDERS = [UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right")]
 _LONGEST, _SHORTEST = 600, 30  # frames of a recording
-_RATE = 30.0
 _LIFT, _HANGING = "lift, others' lengths, own depth", "hanging arms"
 _DIGITS = (1, 1, 0, 0)
 _COLUMNS = ("wrist (cm)", "elbow (cm)", "inside 50 %", "inside 90 %")
@@ -53,13 +50,14 @@ class Unseen(NamedTuple):
 
     Attributes:
         views: of its recordings. few: keypoints that are measured in the second table.
-        prior, arms: fitted without it. lifters: by name.
+        prior, arms, network: fitted without it; the network lifts arms. lifters: by name.
     """
 
     views: Sequence[bones.View]
     few: Sequence[int]
     prior: UpperBodyPrior
     arms: ArmPrior
+    network: ArmLifter
     lifters: dict[str, Lifter]
 
 
@@ -71,6 +69,7 @@ def leave_out(data: Path, name: str, quick: bool, kinds: Sequence[str] = LIFTERS
             steps, and the priors that come with torchpose. kinds: of lifters.
     """
     arms = shipped_arm_prior() if quick else bones.fit_without(data, name)
+    network = shipped_arm_lifter() if quick else arm_lifter.fit_without(data, name, arms)
     if name == _MHAD:
         views, few = bones.mhad_views(data, 150 if quick else 4), bones.FEW
         views = [bones.begun(view) for view in views] if quick else views
@@ -82,35 +81,17 @@ def leave_out(data: Path, name: str, quick: bool, kinds: Sequence[str] = LIFTERS
         prior, hand = fit_kinect_prior(others[:: 20 if quick else 1], seed=0, **bones.FIT), "hand"
     known = {other: share for other, share in bones.SETS.items() if other != name}
     known = {_ONE: known[_ONE]} if quick else known
-    sets = [(share, _joints(bones.recordings(data / o))) for o, share in known.items() if kinds]
+    sets = [
+        (share, bones.with_arms(bones.recordings(data / o))) for o, share in known.items() if kinds
+    ]
     lifters = {kind: fit_lifter(kind, sets, arms, hand, quick) for kind in kinds}
-    return Unseen(views, few, prior, arms, lifters)
+    return Unseen(views, few, prior, arms, network, lifters)
 
 
 def _kinect_views(path: Path, every: int) -> list[bones.View]:
     """Return recordings of a Kinect set in the test camera of UB-people."""
-    joints = [_at_rate(r)[:_LONGEST] for r in bones.recordings(path)[::every]]
+    joints = [bones.at_rate(r)[:_LONGEST] for r in bones.recordings(path)[::every]]
     return bones.seen_by_camera([x for x in joints if len(x) > _SHORTEST])
-
-
-def _at_rate(recording: torchpose.io.Recording) -> Tensor:
-    """Return the eight joints at 30 frames a second, with Kinect's neck where that is known, [T, 8, 3]."""
-    step = max(1, round(float(recording.fps or _RATE) / _RATE))
-    body = recording.upper_body()
-    joints = body.joints.double()[::step]
-    if body.neck == "mid-shoulder":
-        joints = joints.clone()
-        joints[:, _NECK] = (
-            joints[:, _SHOULDERS].mean(1).lerp(joints[:, _HEAD], KINECT_NECK.fraction)
-        )
-    return joints
-
-
-def _joints(found: Sequence[torchpose.io.Recording]) -> list[Tensor]:
-    """Return the frames of recordings in which both arms are known."""
-    joints = [_at_rate(recording) for recording in found]
-    whole = [x[x[:, bones.ENDS].isfinite().flatten(1).all(1)] for x in joints]
-    return [x for x in whole if len(x) > _SHORTEST // 2]
 
 
 def lifted(view: bones.View, lifter: Lifter, few: bool) -> bones.Chains:
@@ -134,7 +115,7 @@ def add_set(report: Report, name: str, unseen: Unseen) -> None:
         chosen = unseen.few if few else None
         rows = {
             method: partial(bones.tracked, prior=unseen.prior, chosen=chosen, **options)
-            for method, options in bones.trackers(unseen.arms).items()
+            for method, options in bones.trackers(unseen.arms, unseen.network).items()
         }
         rows |= {k: partial(lifted, lifter=x, few=few) for k, x in unseen.lifters.items()}
         rows |= {name: simple[name] for name in ((_HANGING,) if few else (_LIFT, _HANGING))}

@@ -18,12 +18,14 @@ from benchmarks.bones.views import (
     ENDS,
     View,
     arm_rows,
+    at_rate,
     begun,
     kinect_views,
     mhad_views,
     openpose_views,
     recordings,
     seen_by_camera,
+    with_arms,
 )
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "Chains",
     "View",
     "arm_rows",
+    "at_rate",
     "begun",
     "errors",
     "fit_without",
@@ -51,4 +54,5 @@ __all__ = [
     "tracked",
     "trackers",
     "true_lengths",
+    "with_arms",
 ]

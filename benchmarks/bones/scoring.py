@@ -13,6 +13,7 @@ import torchpose
 from benchmarks.bones.views import ENDS, View, arm_rows
 from torchpose.metrics import coverage
 from torchpose.priors import UpperBodyPrior
+from torchpose.priors._arm_lifter import ArmLifter
 from torchpose.priors._arms import ArmPrior
 
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
@@ -117,22 +118,21 @@ def true_lengths(view: View) -> Float[Tensor, "2 2"]:
     return view.truth.diff(dim=2).norm(dim=-1).nanmean(0)
 
 
-_KNOWS_ARMS = {
-    "window-mixture": False,
-    "articulated": True,
-    "multiple-model": True,
-    "mkf-fixed": False,
-}
-METHODS = tuple(_KNOWS_ARMS)
+METHODS = ("window-mixture", "articulated", "multiple-model", "mkf-fixed")
 """Methods that are compared."""
 
 
-def trackers(arms: ArmPrior) -> dict[str, dict[str, object]]:
-    """Return the options of the trackers that are compared, by the method's name."""
-    return {
-        name: {"method": name, **({"arms": arms} if knows else {})}
-        for name, knows in _KNOWS_ARMS.items()
+def trackers(arms: ArmPrior, lifter: ArmLifter | None = None) -> dict[str, dict[str, object]]:
+    """Return the options of the trackers that are compared, by the method's name.
+
+    Args:
+        arms: prior over arms. lifter: network that lifts arms; None is that of the package.
+    """
+    options: dict[str, dict[str, object]] = {
+        "articulated": {"arms": arms},
+        "multiple-model": {"arms": arms, "lifter": lifter},
     }
+    return {name: {"method": name, **options.get(name, {})} for name in METHODS}
 
 
 def lifts(mean: Float[Tensor, "2 2"]) -> dict[str, Callable[[View], Chains]]:

@@ -18,6 +18,7 @@ from torchpose.evaluation._trials import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import Recording, read_recordings
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.upper_body._face_points import FACE
 
 _SEVEN = ("wrist_left", "elbow_left", "shoulder_left", "neck", "shoulder_right", "elbow_right",
@@ -31,6 +32,9 @@ _KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
 UTD, UTD_PERSONS, UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
 _QUICK_FRAMES = 4  # of a view of a quick run
+_RATE, _FEWEST = 30.0, 15  # frames per second, and frames with arms, of a recording
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_SHOULDERS = [UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right")]
 
 
 def arm_rows(names: Sequence[str]) -> list[list[int]]:
@@ -204,6 +208,26 @@ def seen_by_camera(joints: Sequence[Float[Tensor, "T 8 3"]]) -> list[View]:
         sure = torch.ones(n, len(_KINECT))
         views.append(View(keypoints[:n], sure, _KINECT, CAMERA, "neck", truth[:n][:, ENDS], 30.0))
     return views
+
+
+def at_rate(recording: Recording) -> Tensor:
+    """Return the eight joints at 30 frames a second, with Kinect's neck where that is known, [T, 8, 3]."""
+    step = max(1, round(float(recording.fps or _RATE) / _RATE))
+    body = recording.upper_body()
+    joints = body.joints.double()[::step]
+    if body.neck == "mid-shoulder":
+        joints = joints.clone()
+        joints[:, _NECK] = (
+            joints[:, _SHOULDERS].mean(1).lerp(joints[:, _HEAD], KINECT_NECK.fraction)
+        )
+    return joints
+
+
+def with_arms(found: Sequence[Recording]) -> list[Tensor]:
+    """Return the frames of recordings in which both arms are known."""
+    joints = [at_rate(recording) for recording in found]
+    whole = [x[x[:, ENDS].isfinite().flatten(1).all(1)] for x in joints]
+    return [x for x in whole if len(x) > _FEWEST]
 
 
 def begun(view: View, frames: int = _QUICK_FRAMES) -> View:

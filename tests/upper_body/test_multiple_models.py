@@ -10,20 +10,28 @@ import torch
 
 from tests.upper_body.test_articulated import CAMERA, ROW, body, pixels
 from torchpose import PinholeCamera
+from torchpose.camera._virtual_camera import axes_along
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
 from torchpose.filters._outputs import FilterOutput
 from torchpose.math import euler_to_matrix
 from torchpose.priors import UpperBodyPrior
+from torchpose.priors._arm_lifter import ArmLifter, LiftedArms, shipped_arm_lifter
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker, _multiple_models
+from torchpose.upper_body._articulated_frame import LIMBS
 from torchpose.upper_body._estimator import Estimates, SeenPoses
 from torchpose.upper_body._fusion import ReadOut, in_body_axes, in_camera_axes, put_at
+from torchpose.upper_body._lifted_ends import Ends
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._multiple_models import _averaged, _clues, _log_odds
 
 BOTH = ("window-mixture", "articulated")
 FEW = ("head", "neck", "hand_left", "hand_right")
+UNSURE = ArmLifter().requires_grad_(False)
+"""A network that is not sure of anything, so that nothing is averaged with it."""
+torch.nn.init.constant_(UNSURE.spread.bias, 20.0)
+WITHOUT_LIFTED = {"multiple-model": {"lifter": UNSURE}}
 INFERRED = [
     UPPER_BODY.index(f"{kind}_{side}")
     for kind in ("shoulder", "elbow")
@@ -36,6 +44,20 @@ def of_performer():
     return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
 
 
+class Told(ArmLifter):
+    """A network that is sure of the elbows and hands of these joints [T, 8, 3], frame by frame."""
+
+    def __init__(self, joints):
+        super().__init__()
+        arms = joints[:, list(LIMBS)].unflatten(1, (2, 2))
+        ends = arms - joints[:, [ROW["shoulder_left"], ROW["shoulder_right"]], None]
+        self.told = (ends.flatten(1, 2) @ axes_along(joints[:, ROW["neck"]])).view_as(ends)
+
+    def forward(self, seen):
+        ends = self.told.expand(*seen.shape[:-2], *self.told.shape)
+        return LiftedArms(ends, torch.full_like(ends[..., 0], 0.05))
+
+
 def of_stranger(n_frames=40):
     return pixels(body(n_frames), 2.0)[None][:, :, [ROW[name] for name in FEW]]
 
@@ -45,11 +67,17 @@ def tracked(prior, keypoints, method, names=FEW, camera=CAMERA, **options):
     return tracker(keypoints, names=list(names))
 
 
+def averaged(prior, keypoints, *args, **options):
+    """Return the average of windows and bones alone."""
+    return tracked(prior, keypoints, "multiple-model", *args, lifter=UNSURE, **options)
+
+
 def shares(prior, keypoints, names=FEW, camera=CAMERA, **options):
     """Return the weight of windows in each frame [T], and how far joints are from that average."""
 
     def joints(method, rows=slice(None), **options):
-        track = tracked(prior, keypoints, method, names, camera, **options)
+        own = WITHOUT_LIFTED.get(method, {})
+        track = tracked(prior, keypoints, method, names, camera, **own, **options)
         return track.joints3d[0][:, rows].flatten(1)
 
     if options.get("smoothing") is None:
@@ -79,11 +107,13 @@ def test_poses_are_the_average_of_both_methods(smoothed_shares, smoothing):
 
 def test_windows_inside_are_not_steadied_where_nobody_wants_that(prior, of_performer):
     """Whole and live; each frame of windows stands by itself then, and joints shake more."""
-    args = prior, of_performer, "multiple-model", KEYPOINT_NAMES, demo_camera()
-    steady, plain = tracked(*args), tracked(*args, steady=False)
+    args = prior, of_performer, KEYPOINT_NAMES, demo_camera()
+    steady, plain = averaged(*args), averaged(*args, steady=False)
     shaking = [track.joints3d[0].diff(n=2, dim=0).norm(dim=-1).mean() for track in (steady, plain)]
     assert float(shaking[1]) > 1.1 * float(shaking[0])
-    tracker = UpperBodyTracker(prior, demo_camera(), "multiple-model", fps=30.0, steady=False)
+    tracker = UpperBodyTracker(
+        prior, demo_camera(), "multiple-model", fps=30.0, steady=False, lifter=UNSURE
+    )
     state = tracker.init(1, names=list(KEYPOINT_NAMES))
     _, live = tracker.advance(state, of_performer)
     torch.testing.assert_close(live.joints3d, plain.joints3d)
@@ -131,7 +161,7 @@ def test_sequences_of_a_batch_do_not_know_of_each_other(prior):
     torch.testing.assert_close(both.joints3d[:1, :20], alone.joints3d, atol=1e-8, rtol=1e-6)
 
 
-USUAL = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2], dtype=torch.float64)
+USUAL = torch.tensor([1.0, *5 * [0.0], 0.06**2, 0.06**2], dtype=torch.float64)
 
 
 def test_smoothed_odds_rest_on_clues_before_and_after(prior, monkeypatch):
@@ -158,13 +188,13 @@ def test_smoothed_odds_rest_on_clues_before_and_after(prior, monkeypatch):
 @pytest.mark.parametrize(("depth", "nearer"), [(0.1, 0.0), (-0.04, 0.6), (-0.2, 1.2)])
 def test_log_odds_are_those_of_the_equation(depth, nearer):
     generator = torch.Generator().manual_seed(0)
-    d, *x = 0.2 * torch.randn(3, 50, generator=generator, dtype=torch.float64) - 0.1
+    d, n, *x = 0.2 * torch.randn(4, 50, generator=generator, dtype=torch.float64) - 0.1
     y = torch.full_like(d, depth)
     weights = torch.exp(-torch.arange(50).flip(0) / 120).double()
-    clues = torch.stack([torch.ones(50).double(), d, y, *x, *(part**2 for part in x)], -1)
-    mean_d = np.average(d, weights=weights)
+    clues = torch.stack([torch.ones(50).double(), d, n, y, *x, *(part**2 for part in x)], -1)
+    mean_d, mean_n = (np.average(part, weights=weights) for part in (d, n))
     varied = np.mean([np.cov(part, aweights=weights, ddof=0) for part in x])
-    expected = 1.0 + 0.5 * mean_d - math.log1p(varied / 0.1**2)
+    expected = 1.0 + 0.5 * mean_d - 4.0 * mean_n - math.log1p(varied / 0.1**2)
     assert float(_log_odds(weights @ clues)) == pytest.approx(expected - nearer)
 
 
@@ -176,7 +206,9 @@ def clues_of(ours, theirs):
         torch.zeros(1, n, 8, 2), torch.ones(1, n, 8, dtype=torch.bool), torch.eye(2)
     )
     windows, bones = (SeenPoses(joints, *6 * [joints]) for joints in (ours, theirs))
-    return _clues(Estimates(arm, arm), Estimates(arm, arm, None, bones), windows, seen)
+    nothing = torch.full((1, n, 2, 2), math.inf, dtype=torch.float64)
+    ends = Ends(nothing.new_zeros(1, n, 2, 2, 3), nothing, seen.mask[..., :2], nothing)
+    return _clues(Estimates(arm, arm), Estimates(arm, arm, None, bones), windows, ends, seen)
 
 
 def test_arms_that_change_their_length_and_small_bodies_tell_against_windows():
@@ -211,8 +243,8 @@ def test_frames_without_arms_leave_the_odds_and_how_far_both_models_are_apart(pr
     keypoints = of_stranger(30)
     keypoints[:, 10:, 2:] = torch.nan
     mixed, bones = (
-        tracked(prior, keypoints, method, smoothing=smoothing, steady=False).joints3d[0]
-        for method in ("multiple-model", "articulated")
+        of(prior, keypoints, smoothing=smoothing, steady=False).joints3d[0]
+        for of in (averaged, functools.partial(tracked, method="articulated"))
     )
     apart = (mixed - bones)[:, INFERRED]
     torch.testing.assert_close(apart[10:], apart[9].expand(20, 4, 3), atol=1e-6, rtol=1e-6)
@@ -296,9 +328,7 @@ def test_covariances_of_windows_are_recalibrated_before(prior):
     with_noise = copy.deepcopy(prior)
     with_noise.set_noise("calibration_scale_causal", torch.full((8,), 4.0))
     with_noise.set_noise("calibration_floor_causal", torch.zeros(8))
-    found = [
-        tracked(own, of_stranger(12), "multiple-model").covariance3d for own in (with_noise, prior)
-    ]
+    found = [averaged(own, of_stranger(12)).covariance3d for own in (with_noise, prior)]
     variances = [x.diagonal(dim1=-2, dim2=-1) for x in found]
     assert bool((variances[0] > variances[1]).all())
 
@@ -310,6 +340,39 @@ def test_covariances_are_narrower_where_both_models_have_weight(prior):
     ]
     shrunk = found[0].diagonal(dim1=-2, dim2=-1).sum() / found[1].diagonal(dim1=-2, dim2=-1).sum()
     assert 0.25 < float(shrunk) < 1.0
+
+
+def test_windows_that_a_network_has_elsewhere_count_less(prior):
+    """A network that is sure of the arms of bones."""
+    keypoints = of_stranger(30)
+    seen = tracked(prior, keypoints, "articulated").joints3d[0]
+    apart = {}
+    for name in (None, *BOTH):
+        lifter = UNSURE if name is None else Told(tracked(prior, keypoints, name).joints3d[0])
+        mixed = tracked(prior, keypoints, "multiple-model", lifter=lifter).joints3d[0]
+        apart[name] = float((mixed - seen)[20:, INFERRED].norm(dim=-1).mean())
+    assert apart["articulated"] < 0.8 * apart[None] < 0.9 * apart["window-mixture"]
+
+
+def test_what_is_no_network_is_refused(prior, tmp_path):
+    for lifter, said in (
+        (3, "lifter must be a network that lifts arms or the path of its file, got int"),
+        (tmp_path / "none.safetensors", "none"),
+    ):
+        with pytest.raises(InputError, match=said):
+            tracked(prior, of_stranger(3), "multiple-model", lifter=lifter)
+
+
+def test_a_network_may_come_from_a_file_and_is_the_one_of_the_package_otherwise(prior, tmp_path):
+    keypoints, file = of_stranger(6), tmp_path / "own.safetensors"
+    UNSURE.save(file)
+    plain, own, read, shipped = (
+        tracked(prior, keypoints, "multiple-model", **options).joints3d
+        for options in ({}, {"lifter": UNSURE}, {"lifter": file}, {"lifter": shipped_arm_lifter()})
+    )
+    torch.testing.assert_close(read, own, atol=1e-6, rtol=0)
+    torch.testing.assert_close(shipped, plain)
+    assert float((plain - own).abs().max()) > 1e-3
 
 
 def test_a_prior_without_windows_is_refused(prior):

@@ -271,7 +271,7 @@ def view_body(
     rays = homogeneous_pixels(torch.stack([target, neck]))
     # K is triangular, so that its inverse is not needed
     rays = torch.linalg.solve_triangular(matrix.mT, rays, upper=False, left=False)
-    wanted, current = _axes(rays)
+    wanted, current = axes_along(rays)
     rotation = wanted @ current.mT
     seen = torch.linalg.vector_norm(height, dim=-1).clamp_min(1e-6)
     farther = (model.height.to(height).norm() / seen).log()
@@ -289,7 +289,7 @@ def _excess(value: Tensor, low: float, high: float) -> Tensor:
     return torch.minimum(line, value.clamp_min(0.0))
 
 
-def _axes(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+def axes_along(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the axes with z along a ray and x level, as columns."""
     z = torch.nn.functional.normalize(ray, dim=-1)
     across = torch.linalg.cross(_down(z.dtype, z.device).expand_as(z), z)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.rows import in_frames, last_known
+from torchpose.errors import InputError
 from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._outputs import first_not_finite
+from torchpose.priors._arm_lifter import ArmLifter, shipped_arm_lifter
 from torchpose.priors._arms import ArmPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
@@ -36,6 +40,7 @@ from torchpose.upper_body._fusion import (
     recalibrated,
     stage_lag,
 )
+from torchpose.upper_body._lifted_ends import Ends, EndsAverage, LiftedState, farther_off
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
@@ -48,11 +53,13 @@ _EVIDENCE_SHARE = 0.5
 _LENGTH_SPREAD = 0.1  # of the log of arms' lengths; by windows, more than this tells against them
 # For each e-fold by which windows put a body nearer than bones do, and at most.
 _NEARNESS_WEIGHT, _MOST_NEARNESS = 15.0, 1.2
+_SIGHT_WEIGHT = 4.0  # of what a network of single frames says for bones
 _USUAL_TIME = 0.25  # seconds of usual frames that clues begin with
-_USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
+_USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
 # between the two. As four sets have it that were in no fit.
 _BETWEEN = 0.5
+_TRUST = 0.6  # factor on covariances of arms that are averaged with lifted ones
 
 
 class MultipleModelState(NamedTuple):
@@ -60,8 +67,9 @@ class MultipleModelState(NamedTuple):
 
     Attributes:
         windows, articulated: the states of both models. motion: the state of the motion stage of windows.
-        clues: the discounted sums of what tells which model knows the person (`_clues`), [B, 7].
+        clues: the discounted sums of what tells which model knows the person (`_clues`), [B, 8].
         apart: how far windows were from bones when an arm was last measured (`_packed`), [B, 43].
+        lifted: what is kept for the network that lifts arms.
     """
 
     windows: WindowState
@@ -69,6 +77,7 @@ class MultipleModelState(NamedTuple):
     motion: MotionStageState | None
     clues: Tensor
     apart: Tensor
+    lifted: LiftedState
 
 
 class MultipleModelFilter(Estimator):
@@ -84,7 +93,8 @@ class MultipleModelFilter(Estimator):
         d_s = sum_arms log p_windows(z_s | ...) - log p_articulated(z_s | ...)
         x_s = log(length of the arm by windows / by bones)
         y_s = log(depth of the neck by windows / by bones)
-        l_t = 1 + 0.5 E[d] - log(1 + Var[x] / 0.1^2) - min(1.2, 15 max(0, -E[y]))
+        n_s = -log p(windows) + log p(bones), by a network that lifts arms (`farther_off`)
+        l_t = 1 + 0.5 E[d] - 4 E[n] - log(1 + Var[x] / 0.1^2) - min(1.2, 15 max(0, -E[y]))
 
     with means E and variances Var, over both arms, of weights a^(t-s), a = e^(-1 / (4 s f)). They begin as
     if a quarter of a second with d = y = 0 and Var[x] = 0.06^2 had preceded.
@@ -107,7 +117,12 @@ class MultipleModelFilter(Estimator):
     calibration = "articulated"
     smooths = True
 
-    def __init__(self, model: TrackerModel, arms: ArmPrior | str | Path | None = None) -> None:
+    def __init__(
+        self,
+        model: TrackerModel,
+        arms: ArmPrior | str | Path | None = None,
+        lifter: ArmLifter | str | Path | None = None,
+    ) -> None:
         self.model = model
         self.windows = self.causal = _windows_of_limbs(model)
         if (
@@ -119,6 +134,10 @@ class MultipleModelFilter(Estimator):
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix_like(model.measurement_cov)
         self.order = model.prior.info.rotation_order
+        wrists = (model.hand or model.prior.info.hand) == "wrist"
+        network = _network_of(model.owner, lifter, self.matrix)
+        trust = _TRUST if model.calibrated else 1.0
+        self.ends = EndsAverage(network, self.matrix, model.rate, wrists, trust)
         self._usual = _USUAL_TIME * model.rate * self.matrix.new_tensor(_USUAL)
 
     def init(
@@ -131,6 +150,7 @@ class MultipleModelFilter(Estimator):
             None,
             self._usual.expand(batch_size, -1),
             self._unknown(batch_size),
+            self.ends.init(batch_size),
         )
 
     def advance(
@@ -144,9 +164,10 @@ class MultipleModelFilter(Estimator):
             motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
         poses = in_camera_axes(reading, self.order)
         poses, apart = _held(poses, bodies, measured, state.apart)
-        sums = self._sums(state.clues, _clues(seen, bodies, poses, measured))
-        mixed = self._mixed(sums, poses, seen, bodies, measured)
-        return MultipleModelState(windows, articulated, motion, sums[:, -1], apart), mixed
+        ends = self.ends.lift(state.lifted, _poses_of(bodies), measured.mask)
+        sums = self._sums(state.clues, _clues(seen, bodies, poses, ends, measured))
+        lifted, mixed = self._mixed(state.lifted, sums, poses, seen, bodies, ends, measured)
+        return MultipleModelState(windows, articulated, motion, sums[:, -1], apart, lifted), mixed
 
     def forward(
         self,
@@ -178,13 +199,16 @@ class MultipleModelFilter(Estimator):
             predicted = self.articulated.filtered(
                 measured, joints, arm_generators, lengths, progress
             )
-        clues = _clues(told, predicted, poses, measured)
+        begun = self.ends.init(len(poses.joints))
+        ends = self.ends.lift(begun, _poses_of(bodies), measured.mask)
+        clues = _clues(told, predicted, poses, ends, measured)
         if lengths is not None:
             inside = inside_lengths(lengths.to(clues.device), clues.shape[1])
             clues = clues * inside[..., None]
         sums = self._sums(self._usual.expand(len(clues), -1), clues)
         sums = sums + self._later_sums(clues) - clues
-        return repeat_last(self._mixed(sums, poses, seen, bodies, measured), lengths)
+        _, mixed = self._mixed(begun, sums, poses, seen, bodies, ends, measured)
+        return repeat_last(mixed, lengths)
 
     def _unknown(self, batch_size: int) -> Float[Tensor, "B 43"]:
         """Return how far both models are apart before an arm was measured."""
@@ -227,18 +251,24 @@ class MultipleModelFilter(Estimator):
 
     def _mixed(
         self,
+        lifted: LiftedState,
         sums: Float[Tensor, "B T K"],
         poses: SeenPoses,
         seen: Estimates,
         bodies: Estimates,
+        ends: Ends,
         measured: MeasuredJoints,
-    ) -> Estimates:
-        """Return the mixture of both models, with its log-evidence.
+    ) -> tuple[LiftedState, Estimates]:
+        """Return the mixture of both models, averaged with what is lifted, with its log-evidence.
 
         Args:
-            sums: the discounted sums of clues.
+            lifted: what is kept of lifted arms. sums: the discounted sums of clues.
             poses: those of windows, after their motion stage.
-            seen, bodies: the estimates of windows and of bones. measured: the measurements.
+            seen, bodies: the estimates of windows and of bones. ends: what is lifted.
+            measured: the measurements.
+
+        Returns:
+            What is kept of lifted arms after the last frame, and the estimates.
         """
         poses = on_their_rays(poses, self.matrix, measured.mask)
         if self.model.calibrated:
@@ -249,6 +279,7 @@ class MultipleModelFilter(Estimator):
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
             mixed = mixed._replace(covs=trust[..., None, None, None] * mixed.covs)
+        lifted, mixed = self.ends.advance(lifted, mixed, ends, measured.mask)
         logs = share.log(), torch.log1p(-share)
         failed_at = first_not_finite(mixed.joints.flatten(2))
         ours, theirs = (
@@ -260,7 +291,7 @@ class MultipleModelFilter(Estimator):
             arm._replace(log_evidence=own, failed_at=failed_at)
             for arm, own in zip(bodies[:2], evidence, strict=True)
         )
-        return Estimates(left, right, None, mixed, bodies.bones)
+        return lifted, Estimates(left, right, None, mixed, bodies.bones)
 
 
 def _windows_of_limbs(model: TrackerModel) -> WindowMixture:
@@ -313,13 +344,17 @@ def _some_arm(mask: Bool[Tensor, "B T 8"]) -> Bool[Tensor, "B T"]:
 
 
 def _clues(
-    windows: Estimates, bodies: Estimates, poses: SeenPoses, measured: MeasuredJoints
-) -> Float[Tensor, "B T 7"]:
-    """Return the clues of each frame: 1 and d, y, x and x^2 of both arms; zero where no limb is measured.
+    windows: Estimates,
+    bodies: Estimates,
+    poses: SeenPoses,
+    ends: Ends,
+    measured: MeasuredJoints,
+) -> Float[Tensor, "B T 8"]:
+    """Return the clues of each frame: 1 and d, n, y, x and x^2 of both arms; zero where no limb is measured.
 
     Args:
-        windows, bodies: the estimates of windows and of bones. poses: those of windows. measured: what
-            both measured.
+        windows, bodies: the estimates of windows and of bones. poses: those of windows. ends: what is
+            lifted. measured: what both measured.
     """
     ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (windows, bodies))
     both = torch.stack([poses.joints, _poses_of(bodies).joints])
@@ -328,18 +363,19 @@ def _clues(
     logs = torch.cat([both[..., _NECK, 2:], lengths], -1).log()
     apart = logs[0] - logs[1]
     ratio = (ours - theirs)[..., None]
-    clues = torch.cat([torch.ones_like(ratio), ratio, apart, apart[..., 1:].square()], -1)
+    off = farther_off(ends, *both, measured.seen)[..., None]
+    clues = torch.cat([torch.ones_like(ratio), ratio, off, apart, apart[..., 1:].square()], -1)
     return torch.where(_some_arm(measured.seen)[..., None], clues.nan_to_num(0.0), 0.0)
 
 
-def _log_odds(sums: Float[Tensor, "*frames 7"]) -> Float[Tensor, " *frames"]:
+def _log_odds(sums: Float[Tensor, "*frames 8"]) -> Float[Tensor, " *frames"]:
     """Return the log-odds of windows, by discounted sums of clues (`_clues`)."""
     means = sums / sums[..., :1].clamp_min(1e-12)  # minutes without an arm are as no frame at all
-    _, ratio, nearness, *_ = means.unbind(-1)
-    varied = (means[..., 5:] - means[..., 3:5].square()).clamp_min(0.0).mean(-1)
+    _, ratio, off, nearness, *_ = means.unbind(-1)
+    varied = (means[..., 6:] - means[..., 4:6].square()).clamp_min(0.0).mean(-1)
     unsteady = torch.log1p(varied / _LENGTH_SPREAD**2)
     nearer = (-_NEARNESS_WEIGHT * nearness).clamp(0.0, _MOST_NEARNESS)
-    return _FIRST + _EVIDENCE_SHARE * ratio - unsteady - nearer
+    return _FIRST + _EVIDENCE_SHARE * ratio - _SIGHT_WEIGHT * off - unsteady - nearer
 
 
 def _averaged(share: Float[Tensor, "B T"], ours: SeenPoses, theirs: SeenPoses) -> SeenPoses:
@@ -366,3 +402,33 @@ def _moments(
     pulled = weight * apart
     spread = pulled[..., :, None] * (apart - pulled)[..., None, :]
     return theirs[0] + pulled, theirs[1].lerp(ours[1], weight[..., None]) + spread
+
+
+def _network_of(owner: nn.Module, lifter: ArmLifter | str | Path | None, like: Tensor) -> ArmLifter:
+    """Return the network that lifts arms, on the device and in the precision of a tensor.
+
+    Args:
+        owner: the module with which it is kept. lifter: a network or its file; None is that of the package.
+        like: the tensor.
+
+    Raises:
+        InputError: something else, or no such file. FileFormatError: a file of another kind.
+    """
+    if not isinstance(lifter, ArmLifter | str | Path | None):
+        raise InputError(
+            f"lifter must be a network that lifts arms or the path of its file, got {type(lifter).__name__}"
+        )
+
+    given: tuple[Tensor, ...] = ()
+    file = str(lifter or "")
+    if isinstance(lifter, ArmLifter):
+        given, file = tuple(lifter.parameters()), ""
+
+    def made() -> ArmLifter:
+        network = lifter if isinstance(lifter, ArmLifter) else None
+        if network is None:
+            network = ArmLifter.load(file) if file else shipped_arm_lifter()
+        with outside_inference():
+            return copy.deepcopy(network).to(like).requires_grad_(False)
+
+    return derived(owner, ("arm lifter", file), (like, *given), made)

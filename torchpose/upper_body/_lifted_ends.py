@@ -1,0 +1,256 @@
+"""Average poses with the elbows and hands that a network lifts, each counting by how sure it is.
+
+A filter knows one person's lengths and where the joints were; a network of single frames (`ArmLifter`) knows
+how arms of many persons look from there. They err differently.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchpose._core.module_state import index_tensor
+from torchpose._core.rows import in_frames, last_known
+from torchpose.priors._arm_lifter import (
+    JOINTS,
+    ArmLifter,
+    arm_features,
+    farthest_so_far,
+    from_neck,
+)
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, LIMBS, SHOULDERS
+from torchpose.upper_body._estimator import SeenPoses
+from torchpose.upper_body._fusion import NEAREST
+
+_ARM = ("shoulder", "elbow", "hand")
+_ARMS = tuple(UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right") for joint in _ARM)
+_ROWS = tuple(UPPER_BODY.index(name) for name in JOINTS)
+_NECK = UPPER_BODY.index("neck")
+_MEMORY = 0.3  # seconds over which a body keeps its factor
+_MODESTY = 0.5  # factor on the variances of poses, to find their share: they are rather too wide
+_STEADY = 0.05  # square metres of arms in the image that speak for a factor of 1 at the beginning
+
+
+class LiftedState(NamedTuple):
+    """What is kept of the frames before.
+
+    Attributes:
+        farthest: how far from the neck each of `JOINTS` was seen, [B, 7].
+        sums: of the products of arms, by which a body is moved, [B, 2].
+        aside: by how much shoulder, elbow and hand of each arm were moved beside that, when its hand was last
+            measured, metres, [B, 2, 3, 3]; 0 before.
+    """
+
+    farthest: Tensor
+    sums: Tensor
+    aside: Tensor
+
+
+class Ends(NamedTuple):
+    """Elbows and hands of both arms from their shoulders, as a network lifts them, in T frames.
+
+    Attributes:
+        ends: camera axes, metres, [B, T, 2, 2, 3]. variance: along every axis, metres squared, [B, T, 2, 2].
+        told: whether the hand of each arm is measured, [B, T, 2].
+        farthest: how far from the neck joints were seen so far, [B, T, 7].
+    """
+
+    ends: Tensor
+    variance: Tensor
+    told: Tensor
+    farthest: Tensor
+
+
+class EndsAverage:
+    """Averages poses with the elbows and hands that a network lifts.
+
+    Vectors a from a shoulder to its elbow or hand, of variance u along an axis, and those b of the network,
+    of variance v, are averaged as of sources whose errors may be alike in an unknown way (covariance
+    intersection with equal shares, Julier and Uhlmann 1997):
+
+        c = (v a + 0.5 u b) / (0.5 u + v),   C = 2 v / (0.5 u + v) A
+
+    with the covariances A and C before and after. The network may know a larger or smaller body. So the
+    body is moved along its rays by the factor that explains c best,
+
+        k = sum a c / sum a a
+
+    over x and y of both arms and the last 0.3 s. Measured joints stay on their rays, and shoulders that
+    are not measured go where c then has them. An arm of which the hand is not measured is moved as when it
+    last was.
+
+    Args:
+        network: that lifts. matrix: K of the prior's camera. fps: frames per second.
+        wrists: whether hands are measured at the wrist. trust: factor on covariances C.
+    """
+
+    def __init__(
+        self,
+        network: ArmLifter,
+        matrix: Float[Tensor, "3 3"],
+        fps: float,
+        wrists: bool,
+        trust: float = 1.0,
+    ) -> None:
+        self.network, self.matrix, self.fps, self.wrists = network, matrix, fps, wrists
+        self.trust, self.forget = trust, math.exp(-1 / (_MEMORY * fps))
+
+    def init(self, batch_size: int) -> LiftedState:
+        """Return the state before the first frame."""
+        zeros = self.matrix.new_zeros
+        sums = self.matrix.new_full((batch_size, 2), _STEADY)
+        return LiftedState(zeros(batch_size, len(JOINTS)), sums, zeros(batch_size, 2, 3, 3))
+
+    def lift(self, state: LiftedState, poses: SeenPoses, known: Bool[Tensor, "B T 8"]) -> Ends:
+        """Return what the network tells of T more frames.
+
+        Args:
+            state: before these frames. poses: of which the pixels are taken. known: which joints are
+                measured.
+        """
+        rows, limbs = index_tensor(_ROWS, known.device), index_tensor(LIMBS, known.device)
+        rays = _rays(poses.uv, self.matrix)
+        given = known.index_select(2, rows)
+        seen, axes = from_neck(rays.index_select(2, rows), rays[:, :, _NECK])
+        farthest = farthest_so_far(seen, given, state.farthest, self.fps)
+        found = self.network(arm_features(seen, given, farthest, self.wrists))
+        ends = (found.ends.flatten(2, 3) @ axes.mT).unflatten(2, (2, 2))
+        metres = poses.joints.index_select(2, limbs)[..., 2] / self.matrix[0, 0]
+        pixels = _along_an_axis(poses.uv_covs.index_select(2, limbs)) * metres.square()
+        variance = found.std.square() + pixels.unflatten(2, (2, 2))
+        return Ends(ends, variance, known[:, :, HANDS], farthest)
+
+    def advance(
+        self, state: LiftedState, poses: SeenPoses, lifted: Ends, known: Bool[Tensor, "B T 8"]
+    ) -> tuple[LiftedState, SeenPoses]:
+        """Return the next state, and the averages of T more frames.
+
+        Args:
+            state: before these frames. poses: to be averaged. lifted: what the network tells. known: which
+                joints are measured.
+        """
+        rows = index_tensor(_ARMS, known.device)
+        arms = poses.joints.index_select(2, rows).unflatten(2, (2, 3))
+        ends = arms[..., 1:, :] - arms[..., :1, :]
+        share = self._share(poses, lifted)
+        both = ends.lerp(lifted.ends, share[..., None])
+        sums = self._sums(state.sums, ends, both, lifted.told)
+        factor = (sums[..., 0] / sums[..., 1])[..., None]
+        arms = factor[..., None, None] * arms
+        seen = known.index_select(2, rows).unflatten(2, (2, 3))
+        aside = _placed(arms, both, seen) - arms
+        aside = in_frames(last_known(lifted.told), state.aside, aside)
+        joints = (factor[..., None] * poses.joints).index_add(2, rows, aside.flatten(2, 3))
+        told = lifted.told[..., None]
+        covs = _scaled(poses.covs, torch.where(told, 2 * self.trust * (1 - share), 1.0))
+        uv = torch.where(known[..., None], poses.uv, _pixels(joints, self.matrix))
+        averaged = poses._replace(joints=joints, covs=covs, uv=uv, place=factor * poses.place)
+        return LiftedState(lifted.farthest[:, -1], sums[:, -1], aside[:, -1]), averaged
+
+    def _share(self, poses: SeenPoses, lifted: Ends) -> Float[Tensor, "B T 2 2"]:
+        """Return the share of the network at each elbow and hand."""
+        covs = poses.covs.index_select(2, index_tensor(LIMBS, poses.covs.device))
+        ours = _MODESTY * _along_an_axis(covs).unflatten(2, (2, 2))
+        return ours / (ours + lifted.variance)
+
+    def _sums(
+        self,
+        before: Float[Tensor, "B 2"],
+        ends: Float[Tensor, "B T 2 2 3"],
+        both: Float[Tensor, "B T 2 2 3"],
+        told: Bool[Tensor, "B T 2"],
+    ) -> Float[Tensor, "B T 2"]:
+        """Return the discounted sums of a c and a a after each frame; without a hand they stay."""
+        level = ends[..., :2] * told[..., None, None]
+        products = torch.stack([both[..., :2], ends[..., :2]], 2) * level[:, :, None]
+        keep = torch.where(told.any(-1), self.forget, 1.0)[..., None]
+        sums = []
+        for kept, new in zip(keep.unbind(1), products.flatten(3).sum(-1).unbind(1), strict=True):
+            before = kept * before + new
+            sums.append(before)
+        return torch.stack(sums, 1)
+
+
+def farther_off(
+    lifted: Ends,
+    ours: Float[Tensor, "B T 8 3"],
+    theirs: Float[Tensor, "B T 8 3"],
+    known: Bool[Tensor, "B T 8"],
+) -> Float[Tensor, "B T"]:
+    """Return how much less likely ours are than theirs, by what a network lifts.
+
+        sum_arms mean_elbow,hand (|a - c|^2 - |b - c|^2) / (2 v)
+
+    over arms of which the hand is measured and the elbow is not.
+
+    Args:
+        lifted: c and v. ours, theirs: joints, of which a and b are elbows and hands from their shoulders.
+        known: which joints are measured.
+    """
+    limbs = index_tensor(LIMBS, known.device)
+    both = torch.stack([ours, theirs])
+    ends = both.index_select(3, limbs).unflatten(3, (2, 2)) - both[:, :, :, SHOULDERS, None]
+    squared = (ends - lifted.ends).square().sum(-1)
+    apart = ((squared[0] - squared[1]) / lifted.variance).mean(-1) / 2
+    return (apart * (lifted.told & ~known[:, :, ELBOWS])).sum(-1)
+
+
+def _placed(
+    arms: Float[Tensor, "B T 2 3 3"],
+    ends: Float[Tensor, "B T 2 2 3"],
+    known: Bool[Tensor, "B T 2 3"],
+) -> Float[Tensor, "B T 2 3 3"]:
+    """Return shoulders, elbows and hands such that those that are measured stay on their rays.
+
+    Args:
+        arms: where they are expected. ends: elbows and hands from their shoulders. known: which joints
+            are measured.
+    """
+    shoulders, elbows, hands = arms.unbind(-2)
+    shoulder, elbow, hand = known[..., None].unbind(-2)
+    wanted = shoulders + ends[..., 1, :]
+    hands = torch.where(hand, _nearest_on(hands, wanted), wanted)
+    shoulders = torch.where(shoulder, shoulders, shoulders + hands - wanted)
+    wanted = shoulders + ends[..., 0, :]
+    elbows = torch.where(elbow, _nearest_on(elbows, wanted), wanted)
+    return torch.stack([shoulders, elbows, hands], -2)
+
+
+def _nearest_on(rays: Float[Tensor, "*batch 3"], points: Float[Tensor, "*batch 3"]) -> Tensor:
+    """Return the points of rays that are nearest to others."""
+    along = (rays * points).sum(-1, keepdim=True) / rays.square().sum(-1, keepdim=True)
+    return along * rays
+
+
+def _scaled(
+    covs: Float[Tensor, "B T 8 3 3"], factors: Float[Tensor, "B T 2 2"]
+) -> Float[Tensor, "B T 8 3 3"]:
+    """Return covariances, those of elbows and hands times factors."""
+    rows = index_tensor(LIMBS, covs.device)
+    ends = covs.index_select(2, rows) * factors.flatten(2)[..., None, None]
+    return covs.index_copy(2, rows, ends)
+
+
+def _along_an_axis(covs: Float[Tensor, "*batch N N"]) -> Float[Tensor, "*batch"]:
+    """Return the mean variance along an axis."""
+    return covs.diagonal(dim1=-2, dim2=-1).mean(-1)
+
+
+def _rays(uv: Float[Tensor, "*batch 2"], matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return K^-1 [u, v, 1]."""
+    pixels = pad(uv, (0, 1), value=1.0)
+    return torch.linalg.solve_triangular(matrix.mT, pixels, upper=False, left=False)
+
+
+def _pixels(
+    joints: Float[Tensor, "*batch 3"], matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch 2"]:
+    """Return where joints project to; far in front where they are not before the camera."""
+    seen = joints @ matrix.mT
+    return seen[..., :2] / seen[..., 2:].clamp_min(NEAREST)
