@@ -55,7 +55,7 @@ def ends_of(joints):
     return joints[..., list(LIMBS), :].unflatten(-2, (2, 2)) - joints[..., SHOULDERS, None, :]
 
 
-def averaged(ends, std=STD, known=WHOLE, given=None, trust=1.0):
+def averaged(ends, std=STD, known=WHOLE, given=None, trust=(1.0, 1.0)):
     given = poses() if given is None else given
     model = EndsAverage(Told(ends, std), MATRIX, 30.0, wrists=False, trust=trust)
     known = known.expand(*given.joints.shape[:2], 8)
@@ -150,12 +150,12 @@ def test_covariances_are_those_of_an_intersection():
     """C = 2 v / (0.5 u + v) A, of arms that are seen alone."""
     known = WHOLE.repeat(2, 5, 1)
     known[1, :, HANDS[0]] = False
-    found = averaged(own_ends(), STD, known, trust=0.6)
+    known[0, :, ELBOWS[1]] = False
+    found = averaged(own_ends(), STD, known, trust=(0.6, 0.75))
     factor = found.covs.diagonal(dim1=-2, dim2=-1)[..., 0] / STD**2
-    ends = torch.tensor([*ELBOWS, *HANDS])
-    torch.testing.assert_close(
-        factor[0, :, ends], torch.full((5, 4), 0.6 * 2 / 1.5, dtype=torch.float64)
-    )
+    for side, trust in ((0, 0.6), (1, 0.75)):
+        ends = factor[0, :, [ELBOWS[side], HANDS[side]]]
+        torch.testing.assert_close(ends, torch.full_like(ends, trust * 2 / 1.5))
     left = [ELBOWS[0], HANDS[0], *BOTH_SHOULDERS, UPPER_BODY.index("neck")]
     torch.testing.assert_close(factor[1, :, left], torch.ones(5, 5, dtype=torch.float64))
 

@@ -87,7 +87,8 @@ class EndsAverage:
 
     Args:
         network: that lifts. matrix: K of the prior's camera. fps: frames per second.
-        wrists: whether hands are measured at the wrist. trust: factor on covariances C.
+        wrists: whether hands are measured at the wrist. trust: factors on the covariances C of arms of which
+            the elbow is measured, and of the others.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class EndsAverage:
         matrix: Float[Tensor, "3 3"],
         fps: float,
         wrists: bool,
-        trust: float = 1.0,
+        trust: tuple[float, float] = (1.0, 1.0),
     ) -> None:
         self.network, self.matrix, self.fps, self.wrists = network, matrix, fps, wrists
         self.trust, self.forget = trust, math.exp(-1 / (_MEMORY * fps))
@@ -147,8 +148,9 @@ class EndsAverage:
         aside = _placed(arms, both, seen) - arms
         aside = in_frames(last_known(lifted.told), state.aside, aside)
         joints = (factor[..., None] * poses.joints).index_add(2, rows, aside.flatten(2, 3))
-        told = lifted.told[..., None]
-        covs = _scaled(poses.covs, torch.where(told, 2 * self.trust * (1 - share), 1.0))
+        trust = torch.where(seen[..., 1:2], *self.trust)
+        factors = torch.where(lifted.told[..., None], 2 * trust * (1 - share), 1.0)
+        covs = _scaled(poses.covs, factors)
         uv = torch.where(known[..., None], poses.uv, _pixels(joints, self.matrix))
         averaged = poses._replace(joints=joints, covs=covs, uv=uv, place=factor * poses.place)
         return LiftedState(lifted.farthest[:, -1], sums[:, -1], aside[:, -1]), averaged

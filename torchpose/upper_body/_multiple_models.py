@@ -1,4 +1,4 @@
-"""Weigh two models of the same body by what each has predicted, and mix what they estimate."""
+"""Weigh two models of the same body by what each has predicted, and mix what they and a network estimate."""
 
 from __future__ import annotations
 
@@ -59,7 +59,9 @@ _USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
 # between the two. As four sets have it that were in no fit.
 _BETWEEN = 0.5
-_TRUST = 0.6  # factor on covariances of arms that are averaged with lifted ones
+# Factors on the covariances of arms that are averaged with lifted ones, of which the elbow is measured, and
+# of the others.
+_TRUST = 0.6, 0.75
 
 
 class MultipleModelState(NamedTuple):
@@ -106,12 +108,17 @@ class MultipleModelFilter(Estimator):
     include how far the two are apart. So lengths of bones change where both have weight; `bone_lengths` are
     those of "articulated".
 
+    Elbows and hands of this average are averaged once more, with those that a network lifts from single
+    frames (`EndsAverage`). That network also tells which of both models is nearer to it, where elbows are not
+    measured.
+
     Args:
         model: the model of the tracker, whose prior has a window that suits.
         arms: as in `ArticulatedFilter`.
+        lifter: the network that lifts arms, or its file; by default the one that comes with the package.
 
     Raises:
-        InputError: no window suits; as `ArticulatedFilter`.
+        InputError: no window suits, or no network; as `ArticulatedFilter`.
     """
 
     calibration = "articulated"
@@ -136,7 +143,7 @@ class MultipleModelFilter(Estimator):
         self.order = model.prior.info.rotation_order
         wrists = (model.hand or model.prior.info.hand) == "wrist"
         network = _network_of(model.owner, lifter, self.matrix)
-        trust = _TRUST if model.calibrated else 1.0
+        trust = _TRUST if model.calibrated else (1.0, 1.0)
         self.ends = EndsAverage(network, self.matrix, model.rate, wrists, trust)
         self._usual = _USUAL_TIME * model.rate * self.matrix.new_tensor(_USUAL)
 

@@ -7,6 +7,7 @@ from typing import TypedDict
 import torch
 from torch import Tensor
 
+from torchpose.priors._arm_lifter import ArmLifter
 from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._pose_track import PoseTrack
 
@@ -27,6 +28,7 @@ class MethodOptions(TypedDict, total=False):
     height: float | None
     initial_cov: Tensor | None
     likelihood_power: float | None
+    lifter: ArmLifter | str | Path | None
     n_particles: int
     n_tracks: int | None
     person: PoseTrack | str | Path | None
