@@ -13,6 +13,7 @@ from torchpose.upper_body._bridged_gaps import bridged_over_gaps
 from torchpose.upper_body._estimator import Estimates, SeenPoses
 from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._lifted_arms import BodyPoints
+from torchpose.upper_body._lifted_ends import Ends
 from torchpose.upper_body._measured_joints import MeasuredJoints, MiddlePoint
 from torchpose.upper_body._multiple_models import _clues
 
@@ -157,5 +158,7 @@ def test_keypoints_in_gaps_do_not_weigh_models():
     joints = torch.rand(1, 30, 8, 3, dtype=torch.float64)
     poses = SeenPoses(joints, *6 * [ones])
     found = Estimates(arm, arm, None, poses)
-    counted = _clues(found, found, poses, bridged)[0, :, 0]
+    vague = torch.full((1, 30, 2, 2), torch.inf, dtype=torch.float64)
+    ends = Ends(vague.new_zeros(1, 30, 2, 2, 3), vague, bridged.mask[..., :2], vague)
+    counted = _clues(found, found, poses, ends, bridged)[0, :, 0]
     assert counted.tolist() == [float(not 10 <= t <= 12) for t in range(30)]

@@ -94,9 +94,9 @@ def test_the_surer_of_both_counts_more():
 
 
 def test_a_network_that_knows_longer_arms_moves_the_body_farther_away():
-    """At equal variances c is a third of the way to b, since ours counts for half."""
+    """At equal variances c is a fifth of the way to b, since ours counts for a quarter."""
     found = averaged(1.3 * own_ends(), STD)
-    factor = 1 + 0.3 / 3
+    factor = 1 + 0.3 / 5
     first, last = found.place[0, [0, -1], 2] / 2.0
     assert 1.0 < float(first) < float(last) < factor
     torch.testing.assert_close(found.uv, poses().uv)
@@ -107,7 +107,7 @@ def test_a_network_that_knows_longer_arms_moves_the_body_farther_away():
 def test_shoulders_that_are_not_measured_go_where_arms_have_them():
     theirs = own_ends() + torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)
     few, whole = (averaged(theirs, STD, known) for known in (FEW, WHOLE))
-    share = 1 / 3
+    share = 1 / 5
     for side in BOTH_SHOULDERS:
         lifted = poses().joints[..., side, 1] - few.joints[..., side, 1]
         assert bool((lifted > 0.8 * share * 0.1).all())
@@ -124,6 +124,15 @@ def test_an_arm_without_a_hand_is_moved_as_when_it_last_had_one():
     torch.testing.assert_close(away[:, 3:, 0, 1], away[:, [2, 2], 0, 1], atol=0.01, rtol=0)
     assert float(away[1, :, 1].abs().max()) < 1e-6  # never seen: not moved
     assert float(away[0, :, 1, 1].max()) < -0.03
+
+
+def test_without_head_and_shoulders_nothing_tells_the_size_of_a_body():
+    theirs = own_ends() + torch.tensor([0.0, 0.0, -0.2], dtype=torch.float64)
+    head = torch.arange(8) == UPPER_BODY.index("head")
+    shoulders = torch.zeros(8, dtype=torch.bool).index_fill(0, torch.tensor(BOTH_SHOULDERS), True)
+    for known, moves in ((FEW & ~head, False), (FEW, True), (FEW & ~head | shoulders, True)):
+        found = averaged(theirs, STD, known)
+        assert bool((found.joints - poses().joints).abs().max() > 0.03) is moves
 
 
 @pytest.mark.parametrize("size", [1, 2])
@@ -147,7 +156,7 @@ def test_a_stream_gives_the_numbers_of_the_whole_recording(size):
 
 
 def test_covariances_are_those_of_an_intersection():
-    """C = 2 v / (0.5 u + v) A, of arms that are seen alone."""
+    """C = 2 v / (0.25 u + v) A, of arms that are seen alone."""
     known = WHOLE.repeat(2, 5, 1)
     known[1, :, HANDS[0]] = False
     known[0, :, ELBOWS[1]] = False
@@ -155,7 +164,7 @@ def test_covariances_are_those_of_an_intersection():
     factor = found.covs.diagonal(dim1=-2, dim2=-1)[..., 0] / STD**2
     for side, trust in ((0, 0.6), (1, 0.75)):
         ends = factor[0, :, [ELBOWS[side], HANDS[side]]]
-        torch.testing.assert_close(ends, torch.full_like(ends, trust * 2 / 1.5))
+        torch.testing.assert_close(ends, torch.full_like(ends, trust * 2 / 1.25))
     left = [ELBOWS[0], HANDS[0], *BOTH_SHOULDERS, UPPER_BODY.index("neck")]
     torch.testing.assert_close(factor[1, :, left], torch.ones(5, 5, dtype=torch.float64))
 

@@ -11,6 +11,7 @@ from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, perform
 from torchpose.errors import InputError, SkeletonError
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import UpperBodyPrior
+from torchpose.priors._arm_lifter import ArmLifter
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import (
@@ -157,7 +158,7 @@ def values(tmp_path_factory):
     person = tall((seen[..., :2] / seen[..., 2:])[None])
     shipped, file = shipped_arm_prior(), tmp_path_factory.mktemp("arms") / "long.safetensors"
     ArmPrior(shipped.directions, 1.2 * shipped.lengths, shipped.spread).save(file)
-    return VALUES | {"arms": str(file), "person": person}
+    return VALUES | {"arms": str(file), "lifter": ArmLifter(), "person": person}
 
 
 @pytest.mark.parametrize("method", METHODS)

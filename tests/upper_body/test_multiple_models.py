@@ -194,7 +194,7 @@ def test_log_odds_are_those_of_the_equation(depth, nearer):
     clues = torch.stack([torch.ones(50).double(), d, n, y, *x, *(part**2 for part in x)], -1)
     mean_d, mean_n = (np.average(part, weights=weights) for part in (d, n))
     varied = np.mean([np.cov(part, aweights=weights, ddof=0) for part in x])
-    expected = 1.0 + 0.5 * mean_d - 4.0 * mean_n - math.log1p(varied / 0.1**2)
+    expected = 1.0 + 0.5 * mean_d - 2.0 * mean_n - math.log1p(varied / 0.1**2)
     assert float(_log_odds(weights @ clues)) == pytest.approx(expected - nearer)
 
 

@@ -31,9 +31,10 @@ from torchpose.upper_body._fusion import NEAREST
 _ARM = ("shoulder", "elbow", "hand")
 _ARMS = tuple(UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right") for joint in _ARM)
 _ROWS = tuple(UPPER_BODY.index(name) for name in JOINTS)
-_NECK = UPPER_BODY.index("neck")
+_NECK, _HEAD = UPPER_BODY.index("neck"), JOINTS.index("head")
+_SHOULDERS = slice(0, len(JOINTS) - 1, len(_ARM))  # of `JOINTS`
 _MEMORY = 0.3  # seconds over which a body keeps its factor
-_MODESTY = 0.5  # factor on the variances of poses, to find their share: they are rather too wide
+_MODESTY = 0.25  # factor on the variances of poses, to find their share: they are rather too wide
 _STEADY = 0.05  # square metres of arms in the image that speak for a factor of 1 at the beginning
 
 
@@ -57,7 +58,8 @@ class Ends(NamedTuple):
 
     Attributes:
         ends: camera axes, metres, [B, T, 2, 2, 3]. variance: along every axis, metres squared, [B, T, 2, 2].
-        told: whether the hand of each arm is measured, [B, T, 2].
+        told: whether the hand of each arm is measured, and head or both shoulders, which tell the size of a
+            body, [B, T, 2].
         farthest: how far from the neck joints were seen so far, [B, T, 7].
     """
 
@@ -74,7 +76,7 @@ class EndsAverage:
     of variance v, are averaged as of sources whose errors may be alike in an unknown way (covariance
     intersection with equal shares, Julier and Uhlmann 1997):
 
-        c = (v a + 0.5 u b) / (0.5 u + v),   C = 2 v / (0.5 u + v) A
+        c = (v a + 0.25 u b) / (0.25 u + v),   C = 2 v / (0.25 u + v) A
 
     with the covariances A and C before and after. The network may know a larger or smaller body. So the
     body is moved along its rays by the factor that explains c best,
@@ -82,8 +84,8 @@ class EndsAverage:
         k = sum a c / sum a a
 
     over x and y of both arms and the last 0.3 s. Measured joints stay on their rays, and shoulders that
-    are not measured go where c then has them. An arm of which the hand is not measured is moved as when it
-    last was.
+    are not measured go where c then has them. An arm of which the hand is not measured, or nothing that
+    tells the size of the body, is moved as when it last was.
 
     Args:
         network: that lifts. matrix: K of the prior's camera. fps: frames per second.
@@ -125,7 +127,8 @@ class EndsAverage:
         metres = poses.joints.index_select(2, limbs)[..., 2] / self.matrix[0, 0]
         pixels = _along_an_axis(poses.uv_covs.index_select(2, limbs)) * metres.square()
         variance = found.std.square() + pixels.unflatten(2, (2, 2))
-        return Ends(ends, variance, known[:, :, HANDS], farthest)
+        sized = given[..., _HEAD] | given[..., _SHOULDERS].all(-1)
+        return Ends(ends, variance, known[:, :, HANDS] & sized[..., None], farthest)
 
     def advance(
         self, state: LiftedState, poses: SeenPoses, lifted: Ends, known: Bool[Tensor, "B T 8"]

@@ -53,7 +53,7 @@ _EVIDENCE_SHARE = 0.5
 _LENGTH_SPREAD = 0.1  # of the log of arms' lengths; by windows, more than this tells against them
 # For each e-fold by which windows put a body nearer than bones do, and at most.
 _NEARNESS_WEIGHT, _MOST_NEARNESS = 15.0, 1.2
-_SIGHT_WEIGHT = 4.0  # of what a network of single frames says for bones
+_SIGHT_WEIGHT = 2.0  # of what a network of single frames says for bones
 _USUAL_TIME = 0.25  # seconds of usual frames that clues begin with
 _USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 # Share by which covariances are too wide where both models have the same weight: the truth is most often
@@ -61,7 +61,7 @@ _USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 _BETWEEN = 0.5
 # Factors on the covariances of arms that are averaged with lifted ones, of which the elbow is measured, and
 # of the others.
-_TRUST = 0.6, 0.75
+_TRUST = 0.45, 0.6
 
 
 class MultipleModelState(NamedTuple):
@@ -96,7 +96,7 @@ class MultipleModelFilter(Estimator):
         x_s = log(length of the arm by windows / by bones)
         y_s = log(depth of the neck by windows / by bones)
         n_s = -log p(windows) + log p(bones), by a network that lifts arms (`farther_off`)
-        l_t = 1 + 0.5 E[d] - 4 E[n] - log(1 + Var[x] / 0.1^2) - min(1.2, 15 max(0, -E[y]))
+        l_t = 1 + 0.5 E[d] - 2 E[n] - log(1 + Var[x] / 0.1^2) - min(1.2, 15 max(0, -E[y]))
 
     with means E and variances Var, over both arms, of weights a^(t-s), a = e^(-1 / (4 s f)). They begin as
     if a quarter of a second with d = y = 0 and Var[x] = 0.06^2 had preceded.
