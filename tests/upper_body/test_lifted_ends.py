@@ -87,6 +87,19 @@ def test_arms_come_to_lie_between_both_and_measured_joints_stay_where_they_are_s
     torch.testing.assert_close(found.uv[..., known, :], poses().uv[..., known, :])
 
 
+def test_pixels_move_as_joints_do():
+    """Pixels of joints that are not measured are means of their own, and not where mean joints project to."""
+    given = poses()
+    apart = torch.zeros_like(given.uv).index_fill(2, torch.tensor(ELBOWS), 30.0)
+    given = given._replace(uv=given.uv + apart)
+    nobody = FEW & ~torch.zeros(8, dtype=torch.bool).index_fill(0, torch.tensor(HANDS), True)
+    theirs = own_ends() + torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(averaged(theirs, STD, nobody, given).uv, given.uv)
+    seen = averaged(theirs, STD, FEW, given)
+    pixels = seen.joints @ MATRIX.mT
+    torch.testing.assert_close(seen.uv - apart, pixels[..., :2] / pixels[..., 2:])
+
+
 def test_the_surer_of_both_counts_more():
     theirs = own_ends() + torch.tensor([0.0, 0.0, -0.2], dtype=torch.float64)
     depths = [ends_of(averaged(theirs, std).joints)[0, 0, 0, 1, 2] for std in (0.03, 0.1, 0.3)]

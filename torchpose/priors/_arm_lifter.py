@@ -86,11 +86,12 @@ class ArmLifter(FittedNetwork):
     def forward(self, seen: Float[Tensor, "*batch F"]) -> LiftedArms:
         """Return the arms that go with these features.
 
-        The standard deviations pass no gradients on to the layers that they share with the arms.
+        In training the standard deviations pass no gradients on to the layers that they share with the arms.
         """
         features = self.hidden(seen)
         ends = self.bones(features).unflatten(-1, (2, 2, 3)).cumsum(-2)
-        log_std = self.spread(features.detach()).unflatten(-1, (2, 2))
+        shared = features.detach() if self.training else features
+        log_std = self.spread(shared).unflatten(-1, (2, 2))
         return LiftedArms(_UNIT * ends, _UNIT * log_std.exp())
 
 

@@ -154,7 +154,8 @@ class EndsAverage:
         trust = torch.where(seen[..., 1:2], *self.trust)
         factors = torch.where(lifted.told[..., None], 2 * trust * (1 - share), 1.0)
         covs = _scaled(poses.covs, factors)
-        uv = torch.where(known[..., None], poses.uv, _pixels(joints, self.matrix))
+        now, before = _pixels(torch.stack([joints, poses.joints]), self.matrix)
+        uv = poses.uv + now - before  # which are not where the mean joints project to
         averaged = poses._replace(joints=joints, covs=covs, uv=uv, place=factor * poses.place)
         return LiftedState(lifted.farthest[:, -1], sums[:, -1], aside[:, -1]), averaged
 

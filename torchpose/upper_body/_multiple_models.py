@@ -61,7 +61,7 @@ _USUAL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.06**2, 0.06**2)
 _BETWEEN = 0.5
 # Factors on the covariances of arms that are averaged with lifted ones, of which the elbow is measured, and
 # of the others.
-_TRUST = 0.45, 0.6
+_TRUST = 0.5, 0.6
 
 
 class MultipleModelState(NamedTuple):
@@ -436,6 +436,6 @@ def _network_of(owner: nn.Module, lifter: ArmLifter | str | Path | None, like: T
         if network is None:
             network = ArmLifter.load(file) if file else shipped_arm_lifter()
         with outside_inference():
-            return copy.deepcopy(network).to(like).requires_grad_(False)
+            return copy.deepcopy(network).to(like).eval().requires_grad_(False)
 
     return derived(owner, ("arm lifter", file), (like, *given), made)
