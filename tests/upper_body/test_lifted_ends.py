@@ -5,6 +5,7 @@ import torch
 
 from torchpose.priors._arm_lifter import ArmLifter, LiftedArms
 from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import _lifted_ends
 from torchpose.upper_body._articulated_frame import LIMBS, SHOULDERS
 from torchpose.upper_body._estimator import SeenPoses
 from torchpose.upper_body._lifted_ends import EndsAverage, farther_off
@@ -115,6 +116,20 @@ def test_a_network_that_knows_longer_arms_moves_the_body_farther_away():
     torch.testing.assert_close(found.uv, poses().uv)
     middle = UPPER_BODY.index("neck")
     torch.testing.assert_close(found.joints[:, :, middle, 2], found.place[..., 2])
+
+
+def test_a_network_that_is_wrong_and_sure_does_not_move_the_body_behind_the_camera():
+    for ends in (-own_ends(), 20 * own_ends()):
+        depth = averaged(ends, 1e-3).place[..., 2]
+        assert float(depth.min()) > 1.6 - 1e-9 and float(depth.max()) < 2.5 + 1e-9
+
+
+def test_many_frames_are_lifted_in_parts(monkeypatch):
+    whole = averaged(1.2 * own_ends(), STD, FEW)
+    monkeypatch.setattr(_lifted_ends, "_AT_ONCE", 3)
+    parts = averaged(1.2 * own_ends(), STD, FEW)
+    torch.testing.assert_close(parts.joints, whole.joints, atol=0, rtol=0)
+    torch.testing.assert_close(parts.covs, whole.covs, atol=0, rtol=0)
 
 
 def test_shoulders_that_are_not_measured_go_where_arms_have_them():

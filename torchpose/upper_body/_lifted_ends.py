@@ -15,10 +15,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchpose._core.module_state import index_tensor
-from torchpose._core.rows import in_frames, last_known
+from torchpose._core.rows import in_frames, joined, last_known
 from torchpose.priors._arm_lifter import (
     JOINTS,
     ArmLifter,
+    LiftedArms,
     arm_features,
     farthest_so_far,
     from_neck,
@@ -34,6 +35,8 @@ _ROWS = tuple(UPPER_BODY.index(name) for name in JOINTS)
 _NECK, _HEAD = UPPER_BODY.index("neck"), JOINTS.index("head")
 _SHOULDERS = slice(0, len(JOINTS) - 1, len(_ARM))  # of `JOINTS`
 _MEMORY = 0.3  # seconds over which a body keeps its factor
+_MOST = 1.25  # of that factor, or 1 over it
+_AT_ONCE = 4096  # frames whose hidden layers are kept together
 _MODESTY = 0.25  # factor on the variances of poses, to find their share: they are rather too wide
 _STEADY = 0.05  # square metres of arms in the image that speak for a factor of 1 at the beginning
 
@@ -83,9 +86,9 @@ class EndsAverage:
 
         k = sum a c / sum a a
 
-    over x and y of both arms and the last 0.3 s. Measured joints stay on their rays, and shoulders that
-    are not measured go where c then has them. An arm of which the hand is not measured, or nothing that
-    tells the size of the body, is moved as when it last was.
+    over x and y of both arms and the last 0.3 s, from 0.8 to 1.25. Measured joints stay on their rays, and
+    shoulders that are not measured go where c then has them. An arm of which the hand is not measured, or
+    nothing that tells the size of the body, is moved as when it last was.
 
     Args:
         network: that lifts. matrix: K of the prior's camera. fps: frames per second.
@@ -122,7 +125,7 @@ class EndsAverage:
         given = known.index_select(2, rows)
         seen, axes = from_neck(rays.index_select(2, rows), rays[:, :, _NECK])
         farthest = farthest_so_far(seen, given, state.farthest, self.fps)
-        found = self.network(arm_features(seen, given, farthest, self.wrists))
+        found = self._found(arm_features(seen, given, farthest, self.wrists))
         ends = (found.ends.flatten(2, 3) @ axes.mT).unflatten(2, (2, 2))
         metres = poses.joints.index_select(2, limbs)[..., 2] / self.matrix[0, 0]
         pixels = _along_an_axis(poses.uv_covs.index_select(2, limbs)) * metres.square()
@@ -145,7 +148,7 @@ class EndsAverage:
         share = self._share(poses, lifted)
         both = ends.lerp(lifted.ends, share[..., None])
         sums = self._sums(state.sums, ends, both, lifted.told)
-        factor = (sums[..., 0] / sums[..., 1])[..., None]
+        factor = (sums[..., 0] / sums[..., 1]).clamp(1 / _MOST, _MOST)[..., None]
         arms = factor[..., None, None] * arms
         seen = known.index_select(2, rows).unflatten(2, (2, 3))
         aside = _placed(arms, both, seen) - arms
@@ -158,6 +161,14 @@ class EndsAverage:
         uv = poses.uv + now - before  # which are not where the mean joints project to
         averaged = poses._replace(joints=joints, covs=covs, uv=uv, place=factor * poses.place)
         return LiftedState(lifted.farthest[:, -1], sums[:, -1], aside[:, -1]), averaged
+
+    def _found(self, features: Float[Tensor, "B T F"]) -> LiftedArms:
+        """Return what the network tells, of some frames at a time."""
+        frames = features.flatten(0, 1).split(_AT_ONCE)
+        if len(frames) == 1:
+            return self.network(features)
+        ends, std = joined([self.network(part) for part in frames])
+        return LiftedArms(*(x.unflatten(0, features.shape[:2]) for x in (ends, std)))
 
     def _share(self, poses: SeenPoses, lifted: Ends) -> Float[Tensor, "B T 2 2"]:
         """Return the share of the network at each elbow and hand."""

@@ -370,7 +370,7 @@ def _clues(
     logs = torch.cat([both[..., _NECK, 2:], lengths], -1).log()
     apart = logs[0] - logs[1]
     ratio = (ours - theirs)[..., None]
-    off = farther_off(ends, *both, measured.seen)[..., None]
+    off = farther_off(ends, both[0], both[1], measured.seen)[..., None]
     clues = torch.cat([torch.ones_like(ratio), ratio, off, apart, apart[..., 1:].square()], -1)
     return torch.where(_some_arm(measured.seen)[..., None], clues.nan_to_num(0.0), 0.0)
 
