@@ -90,8 +90,8 @@ class BodyKeypointMeasurer:
 
     def observed(self, frames: KeypointFrame, t: int) -> KeypointMeasurement:
         """Return the measurement of one frame, of one element."""
-        own = self.tracker.tracker.filter
-        return KeypointMeasurement(frames.map(lambda v: v[t : t + 1]), own.maps, own.exchange)
+        maps = self.tracker.tracker.filter.maps
+        return KeypointMeasurement(frames.map(lambda v: v[t : t + 1]), maps)
 
     def first_frame(self, frames: KeypointFrame) -> int:
         """Return the first frame with enough joints for a first pose: the one in which "kalman" begins.

@@ -11,11 +11,7 @@ from torchpose import BodyTracker
 from torchpose.body import BODY_15, Body
 from torchpose.body._skeleton import other_side
 from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeError
-from torchpose.whole_body._keypoints.keypoint_likelihood import (
-    KeypointFrame,
-    RigMaps,
-    exchange_of,
-)
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
 from torchpose.whole_body._keypoints.particle_likelihood import (
     KeypointMeasurement,
     keypoint_log_likelihood,
@@ -28,7 +24,6 @@ METHODS = {
 }  # fmt: skip
 _ARMS = ("left_shoulder", "left_elbow", "left_wrist")
 _LEGS = ("left_hip", "left_knee", "left_ankle")
-SIDES = exchange_of(BODY_15, torch.device("cpu"))
 _ODDS = 1 / (1 + math.exp(3.0))  # prior probability of exchanged sides
 
 
@@ -36,7 +31,7 @@ def _measured(seen, t=0, power=1.0):
     pixels = seen.keypoints[t : t + 1].clone()
     one = torch.ones_like(pixels[..., 0])
     return KeypointMeasurement(
-        KeypointFrame(pixels, one, 0.012**2 * one, 0.9 * one), RigMaps.of(seen.rig), SIDES, power
+        KeypointFrame(pixels, one, 0.012**2 * one, 0.9 * one), RigMaps.of(seen.rig), power
     )
 
 
@@ -143,7 +138,7 @@ def test_keypoints_turn_limbs_towards_where_they_are():
     mean = state[..., 6:].unflatten(-1, (-1, 3))
     cov = (0.1**2 * torch.eye(3, dtype=torch.float64)).expand(*mean.shape, 3).clone()
     new, new_cov = limbs_given_keypoints(
-        KeypointMeasurement(frame, RigMaps.of(rig), SIDES), body, state, mean, cov
+        KeypointMeasurement(frame, RigMaps.of(rig)), body, state, mean, cov
     )
     found = body.joints(body.with_relative(state, new.flatten(-2)))
     wrist = BODY_15.joint("left_wrist")
@@ -283,21 +278,3 @@ def test_bad_keypoints_are_refused():
         kalman(masks, keypoints=seen.keypoints)
     with pytest.raises(InputError, match="takes keypoints and no silhouettes"):
         kalman.step(kalman.init(), masks[0], keypoints=seen.keypoints[0])
-
-
-def test_the_sides_that_may_be_exchanged_are_made_once(monkeypatch):
-    """An annealed filter weighs its particles several times in each frame."""
-    made = []
-    monkeypatch.setattr(
-        "torchpose.whole_body._keypoints.body_kalman.exchange_of",
-        lambda *given: made.append(given) or exchange_of(*given),
-    )
-    monkeypatch.setattr(
-        "torchpose.whole_body._keypoints.particle_likelihood.exchange_of",
-        lambda *given: made.append(given) or exchange_of(*given),
-        raising=False,
-    )
-    seen = scene(cameras=2, n_frames=6)
-    tracker = BodyTracker(seen.rig, "apf", height=1.75, fps=30.0, n_particles=50)
-    tracker(keypoints=seen.keypoints, generator=torch.Generator().manual_seed(0))
-    assert len(made) == 1

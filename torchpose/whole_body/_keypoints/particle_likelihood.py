@@ -19,15 +19,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
 from torchpose.math._rotations import quaternion_vector_to_matrix, within_unit_ball
 from torchpose.math._unscented import floor_eigenvalues, sigma_points
 from torchpose.whole_body._keypoints.keypoint_likelihood import (
     Beliefs,
-    Exchange,
     KeypointFrame,
     RigMaps,
     Seen,
     Weighed,
+    exchange_of,
     information,
     readings_of,
     see,
@@ -43,13 +44,11 @@ class KeypointMeasurement(NamedTuple):
     """Holds the keypoints of one frame of B persons, and the cameras that see them.
 
     Attributes:
-        frame: keypoints [B, C, J, ...] of `BODY_15`'s joints. maps: of the C cameras.
-        exchange: the groups of joints whose sides may be exchanged. power: the exponent k.
+        frame: keypoints [B, C, J, ...] of `BODY_15`'s joints. maps: of the C cameras. power: the exponent k.
     """
 
     frame: KeypointFrame
     maps: RigMaps
-    exchange: Exchange
     power: float = _POWER
 
     @property
@@ -132,7 +131,7 @@ def _weighed(
 ) -> tuple[KeypointFrame, Seen, Weighed]:
     """Return both readings of keypoints for every particle, its joints in the cameras, and the weights."""
     batch, n = joints.shape[:2]
-    maps, exchange = measured.maps, measured.exchange
+    maps, exchange = measured.maps, exchange_of(BODY_15, measured.maps.shift.device)
     readings = readings_of(measured.frame, exchange).map(
         lambda v: v[:, :, None].expand(-1, -1, n, *v.shape[2:]).flatten(1, 2)
     )
