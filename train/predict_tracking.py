@@ -64,6 +64,7 @@ class BatchTracker:
         files = {
             "camera": tracker.camera_file,
             "arms": settings["arms"],
+            "lifter": settings["lifter"],
             "person": settings["person"],
         }
         settings |= {key: content_of(Path(file)) for key, file in files.items() if file}

@@ -20,7 +20,7 @@ _METAVARS = {
     "camera_names": "NAME,...", "components": "K", "conditionals": "NAME|FILE",
     "delays": "[n,n,...]", "face_model": "FILE",
     "facing": "[x,y,z]", "fps": "HZ", "height": "M", "held_out": "PERSON",
-    "initial_pose": "FILE", "licence": "TEXT", "manifold": "NAME|FILE", "max_gap": "S",
+    "initial_pose": "FILE", "licence": "TEXT", "lifter": "FILE", "manifold": "NAME|FILE", "max_gap": "S",
     "measurement_std": "PX", "motion": "NAME|FILE", "neck": "KIND", "noise_of": "PRIOR",
     "out": "DIR", "person": "FILE", "persons": "PERSON", "prior": "NAME|FILE",
     "recordings": "DIR", "roll": "DEGREES", "seconds": "S", "smoothing": "N|full", "tilt": "DEGREES",

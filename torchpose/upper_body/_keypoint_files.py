@@ -51,6 +51,8 @@ class TrackSettings:
         n_particles: the number of particles of the pf methods (default 10000).
         n_tracks: the number of tracks of mkf-sampled and mkf-split.
         arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
+        lifter: multiple-model: the file of a network that lifts arms; by default the one that comes with
+            torchpose.
         bone_lengths: articulated: lengths measured on the person in metres, with commas: any of
             upper_arm=, forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above
             Kinect's neck, which is 10.5 cm above the middle of the shoulders).
@@ -86,6 +88,7 @@ class TrackSettings:
     n_particles: int | None = None
     n_tracks: int | None = None
     arms: str | None = None
+    lifter: str | None = None
     bone_lengths: str | None = None
     height: float | None = None
     person: str | None = None
@@ -136,7 +139,7 @@ class TrackSettings:
                 options[name] = value
         if self.bone_lengths is not None:
             options["bone_lengths"] = _lengths_of(self.bone_lengths)
-        own = {name: getattr(self, name) for name in ("arms", "height", "person")}
+        own = {name: getattr(self, name) for name in ("arms", "lifter", "height", "person")}
         return options | {name: value for name, value in own.items() if value is not None}
 
 
