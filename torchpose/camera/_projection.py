@@ -91,6 +91,14 @@ def homogeneous_pixels(uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3
     return torch.nn.functional.pad(uv, (0, 1), value=1.0)
 
 
+def pixel_rays(
+    uv: Float[Tensor, "*batch 2"], matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Return K^-1 [u, v, 1]; K is triangular, so that its inverse is not needed."""
+    pixels = homogeneous_pixels(uv)
+    return torch.linalg.solve_triangular(matrix.mT, pixels, upper=False, left=False)
+
+
 def scale_matrix(
     matrix: Float[Tensor, "*batch 3 3"], sx: Tensor | float, sy: Tensor | float
 ) -> Float[Tensor, "*batch 3 3"]:

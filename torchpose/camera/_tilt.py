@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.camera._projection import homogeneous_pixels, turn_homography
+from torchpose.camera._projection import homogeneous_pixels, pixel_rays, turn_homography
 from torchpose.errors import CameraError
 
 LARGEST_PITCH = math.radians(60.0)
@@ -148,10 +148,7 @@ class Turn(NamedTuple):
         Args:
             uv: the pixels before the turn. matrix: K of both.
         """
-        rays = torch.linalg.solve_triangular(
-            matrix.to(uv).mT, homogeneous_pixels(uv), upper=False, left=False
-        )
-        turned = rays @ self.rotation.to(uv).mT
+        turned = pixel_rays(uv, matrix.to(uv)) @ self.rotation.to(uv).mT
         return turned[..., 2] > _LEAST_COSINE * turned.norm(dim=-1)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import index_tensor, outside_inference
-from torchpose.camera._projection import homogeneous_pixels, turn_homography
+from torchpose.camera._projection import homogeneous_pixels, pixel_rays, turn_homography
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 MEMORY = 1.0
@@ -268,10 +268,7 @@ def view_body(
     aside = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
     room = _BESIDE * matrix[0, 0] / aside.clamp_min(1e-6)
     target = model.neck.to(neck) + offset * room.clamp_max(1.0)
-    rays = homogeneous_pixels(torch.stack([target, neck]))
-    # K is triangular, so that its inverse is not needed
-    rays = torch.linalg.solve_triangular(matrix.mT, rays, upper=False, left=False)
-    wanted, current = axes_along(rays)
+    wanted, current = axes_along(pixel_rays(torch.stack([target, neck]), matrix))
     rotation = wanted @ current.mT
     seen = torch.linalg.vector_norm(height, dim=-1).clamp_min(1e-6)
     farther = (model.height.to(height).norm() / seen).log()

@@ -18,6 +18,7 @@ from torchpose.camera._projection import (
     join_arms,
     lift,
     pixel_covariances,
+    pixel_rays,
 )
 from torchpose.camera._virtual_camera import from_view
 from torchpose.filters._constant_velocity import (
@@ -121,8 +122,7 @@ def on_their_rays(
     hands = known.index_select(2, index_tensor(_HAND_OF, known.device))
     seen = poses.joints @ matrix.mT
     uv = torch.where(hands & ~known & before, seen[..., :2] / depth, poses.uv)
-    pixels = torch.nn.functional.pad(uv, (0, 1), value=1.0)
-    moved = depth * torch.linalg.solve_triangular(matrix.mT, pixels, upper=False, left=False)
+    moved = depth * pixel_rays(uv, matrix)
     joints = torch.where(_limb_ends(uv.device) & known & before, moved, poses.joints)
     return poses._replace(joints=joints, uv=uv)
 
