@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar, cast
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 T = TypeVar("T")
@@ -43,6 +43,27 @@ def in_frames(last: Int[Tensor, "B T *rest"], before: Tensor, values: Tensor) ->
     """
     rows = last.view(*last.shape, *[1] * (values.ndim - last.ndim)).expand_as(values)
     return torch.cat([before[:, None], values], 1).gather(1, rows)
+
+
+def discounted_sums(
+    before: Float[Tensor, "B K"],
+    values: Float[Tensor, "B T K"],
+    keep: float | Float[Tensor, "B T 1"],
+) -> Float[Tensor, "B T K"]:
+    """Return s_t = a s_(t-1) + x_t of every frame.
+
+    Args:
+        before: s before the first frame. values: x. keep: a, of every frame or the same for all.
+    """
+    n_frames = values.shape[1]
+    factors: Sequence[float | Tensor] = (
+        keep.unbind(1) if isinstance(keep, Tensor) else n_frames * (keep,)
+    )
+    sums = []
+    for kept, now in zip(factors, values.unbind(1), strict=True):
+        before = kept * before + now
+        sums.append(before)
+    return torch.stack(sums, 1)
 
 
 def joined(parts: Sequence[T], dim: int = 0) -> T:

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchpose._core.module_state import index_tensor
-from torchpose._core.rows import in_frames, joined, last_known
+from torchpose._core.rows import discounted_sums, in_frames, joined, last_known
+from torchpose.camera._projection import pixel_rays
 from torchpose.priors._arm_lifter import (
     JOINTS,
     ArmLifter,
@@ -121,7 +121,7 @@ class EndsAverage:
                 measured.
         """
         rows, limbs = index_tensor(_ROWS, known.device), index_tensor(LIMBS, known.device)
-        rays = _rays(poses.uv, self.matrix)
+        rays = pixel_rays(poses.uv, self.matrix)
         given = known.index_select(2, rows)
         seen, axes = from_neck(rays.index_select(2, rows), rays[:, :, _NECK])
         farthest = farthest_so_far(seen, given, state.farthest, self.fps)
@@ -187,11 +187,7 @@ class EndsAverage:
         level = ends[..., :2] * told[..., None, None]
         products = torch.stack([both[..., :2], ends[..., :2]], 2) * level[:, :, None]
         keep = torch.where(told.any(-1), self.forget, 1.0)[..., None]
-        sums = []
-        for kept, new in zip(keep.unbind(1), products.flatten(3).sum(-1).unbind(1), strict=True):
-            before = kept * before + new
-            sums.append(before)
-        return torch.stack(sums, 1)
+        return discounted_sums(before, products.flatten(3).sum(-1), keep)
 
 
 def farther_off(
@@ -257,12 +253,6 @@ def _scaled(
 def _along_an_axis(covs: Float[Tensor, "*batch N N"]) -> Float[Tensor, "*batch"]:
     """Return the mean variance along an axis."""
     return covs.diagonal(dim1=-2, dim2=-1).mean(-1)
-
-
-def _rays(uv: Float[Tensor, "*batch 2"], matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Return K^-1 [u, v, 1]."""
-    pixels = pad(uv, (0, 1), value=1.0)
-    return torch.linalg.solve_triangular(matrix.mT, pixels, upper=False, left=False)
 
 
 def _pixels(

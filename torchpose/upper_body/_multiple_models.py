@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.module_state import derived, outside_inference
-from torchpose._core.rows import in_frames, last_known
+from torchpose._core.rows import discounted_sums, in_frames, last_known
 from torchpose.errors import InputError
 from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._outputs import first_not_finite
@@ -172,7 +172,9 @@ class MultipleModelFilter(Estimator):
         poses = in_camera_axes(reading, self.order)
         poses, apart = _held(poses, bodies, measured, state.apart)
         ends = self.ends.lift(state.lifted, _poses_of(bodies), measured.mask)
-        sums = self._sums(state.clues, _clues(seen, bodies, poses, ends, measured))
+        sums = discounted_sums(
+            state.clues, _clues(seen, bodies, poses, ends, measured), self.forget
+        )
         lifted, mixed = self._mixed(state.lifted, sums, poses, seen, bodies, ends, measured)
         return MultipleModelState(windows, articulated, motion, sums[:, -1], apart, lifted), mixed
 
@@ -212,7 +214,7 @@ class MultipleModelFilter(Estimator):
         if lengths is not None:
             inside = inside_lengths(lengths.to(clues.device), clues.shape[1])
             clues = clues * inside[..., None]
-        sums = self._sums(self._usual.expand(len(clues), -1), clues)
+        sums = discounted_sums(self._usual.expand(len(clues), -1), clues, self.forget)
         sums = sums + self._later_sums(clues) - clues
         _, mixed = self._mixed(begun, sums, poses, seen, bodies, ends, measured)
         return repeat_last(mixed, lengths)
@@ -236,19 +238,9 @@ class MultipleModelFilter(Estimator):
             return None
         return kept_stage(model.owner, ratios, model.rate, model.measurement_cov)
 
-    def _sums(
-        self, before: Float[Tensor, "B K"], clues: Float[Tensor, "B T K"]
-    ) -> Float[Tensor, "B T K"]:
-        """Return the discounted sums of clues after each frame."""
-        sums = []
-        for now in clues.unbind(1):
-            before = self.forget * before + now
-            sums.append(before)
-        return torch.stack(sums, 1)
-
     def _later_sums(self, clues: Float[Tensor, "B T K"]) -> Float[Tensor, "B T K"]:
         """Return the discounted sums of each frame and of the later ones that smoothing uses."""
-        later = self._sums(torch.zeros_like(clues[:, 0]), clues.flip(1)).flip(1)
+        later = discounted_sums(torch.zeros_like(clues[:, 0]), clues.flip(1), self.forget).flip(1)
         lag = self.model.smoothing
         if not isinstance(lag, int) or lag + 1 >= clues.shape[1]:
             return later
