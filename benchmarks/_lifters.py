@@ -44,6 +44,7 @@ _NEIGHBOURS = 60_000  # frames that are kept
 _TARGET = 0.2  # metres
 _TURN, _TILT, _ANY = math.radians(15.0), math.radians(8.0), 0.3
 _DEPTH, _DEPTH_STD, _NEAREST = 2.6, 0.4, 0.9
+_ASIDE = 0.2  # of the depth
 _NOISE = 3.0 / 525.0  # of a pixel over the focal length
 FEW = (False, False, True)  # of shoulder, elbow and hand
 _ARMS = [list(LEFT_ARM[2::-1]), list(RIGHT_ARM[2::-1])]  # shoulder, elbow and hand
@@ -225,6 +226,18 @@ class ArmExamples:
         joints[:, :, [rows[1:] for rows in _ARMS]] = ends
         return joints, bones
 
+    def place(
+        self, count: int, depth: float, depth_std: float, nearest: float
+    ) -> Float[Tensor, "N 3"]:
+        """Return places of bodies before the camera, metres.
+
+        Args:
+            count: of bodies. depth, depth_std: median, and standard deviation of its log. nearest: the least.
+        """
+        far = (depth * (depth_std * self.normal(count)).exp()).clamp_min(nearest)
+        aside = _ASIDE * self.normal(count, 2)
+        return torch.cat([aside, torch.ones(count, 1)], 1) * far[:, None]
+
     def normal(self, *shape: int) -> Tensor:
         """Return normal random numbers."""
         return torch.randn(*shape, generator=self.generator)
@@ -255,9 +268,7 @@ class _Examples(ArmExamples):
     def __call__(self, frames: int, count: int) -> tuple[Tensor, Tensor]:
         """Return features [count, frames, F] and bones [count, frames, 12] in units of `_TARGET`."""
         joints, bones = self.bodies(frames, count)
-        depth = (_DEPTH * (_DEPTH_STD * self.normal(count)).exp()).clamp_min(_NEAREST)
-        aside = 0.2 * self.normal(count, 2)
-        place = torch.cat([aside, torch.ones(count, 1)], 1) * depth[:, None]
+        place = self.place(count, _DEPTH, _DEPTH_STD, _NEAREST)
         ends = joints[:, :, _ARMS] + place[:, None, None, None]
         neck = ends[:, :, :, 0].mean(2) + 0.015 * self.normal(count, 1, 3)
         rays, middle = (x[..., :2] / x[..., 2:].clamp_min(0.2) for x in (ends, neck))

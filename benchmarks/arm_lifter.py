@@ -43,14 +43,14 @@ _STEPS, _PIECES, _FRAMES, _SHOWN = 5_000, 48, 48, 12  # pieces of a step, their 
 _SEED = 0
 _RATE = 30.0
 _DEPTH, _DEPTH_STD, _NEAREST = 2.2, 0.55, 0.5
-_ASIDE = 0.2  # of the depth
 _NOISE, _NOISE_STD = 3.0 / 525.0, 0.5  # of a pixel over the focal length, and of its log
 _WHOLE, _FEW, _HEADLESS, _KEPT = 0.5, 0.3, 0.3, 0.7  # shares of pieces; of joints of the others
 _BLINKING, _BLINK = 0.3, 0.02  # shares of pieces and of frames in which joints are missing
 _SPREAD_SHARE = 0.1  # of the loss
+_UNIT = 0.2  # metres in which errors count
 _ROWS = [UPPER_BODY.index(name) for name in JOINTS]
 _NECK, _HEAD = UPPER_BODY.index("neck"), JOINTS.index("head")
-_END = torch.tensor([*FEW, *FEW, True])
+_GIVEN_OF_FEW = torch.tensor([*FEW, *FEW, True])
 
 
 def fit_without(
@@ -73,7 +73,6 @@ def fit_without(
     for name, share in kept.items():
         found = [r for r in bones.recordings(data / name) if r.person not in persons.get(name, ())]
         sets.append((share, bones.with_arms(found)))
-    torch.manual_seed(_SEED)
     info = ArmLifterInfo(
         name="arms",
         recordings=tuple(name.split("/")[0] for name in kept),
@@ -81,8 +80,23 @@ def fit_without(
         licence="MIT; see the card for the recordings",
         command="python -m benchmarks.arm_lifter --data DIR --fit FILE.safetensors",
     )
-    network = ArmLifter(info)
-    draw = _Examples(sets, arms)
+    return fit_network(sets, arms, info, quick)
+
+
+def fit_network(
+    sets: Sequence[tuple[float, Sequence[Tensor]]],
+    arms: ArmPrior,
+    info: ArmLifterInfo | None = None,
+    quick: bool = False,
+) -> ArmLifter:
+    """Return a network that is fitted to sets of recordings.
+
+    Args:
+        sets: share and joints [T, 8, 3] of each. arms: whose lengths of bones are taken. info: facts about
+            the fit. quick: few steps, to see that it works.
+    """
+    torch.manual_seed(_SEED)
+    network, draw = ArmLifter(info), _Examples(sets, arms)
     train_lifter(network, lambda: _loss(network, *draw()), 2 if quick else _STEPS, "arm lifter")
     return network.requires_grad_(False)
 
@@ -100,9 +114,7 @@ class _Examples:
         self.wrists = not self.wrists
         examples = self.of_kind[self.wrists]
         joints, arms = examples.bodies(_FRAMES, _PIECES)
-        depth = (_DEPTH * (_DEPTH_STD * examples.normal(_PIECES)).exp()).clamp_min(_NEAREST)
-        aside = torch.cat([_ASIDE * examples.normal(_PIECES, 2), torch.ones(_PIECES, 1)], 1)
-        joints = joints + (aside * depth[:, None])[:, None, None]
+        joints = joints + examples.place(_PIECES, _DEPTH, _DEPTH_STD, _NEAREST)[:, None, None]
         rays = joints[..., :2] / joints[..., 2:].clamp_min(0.2)
         noise = _NOISE * (_NOISE_STD * examples.normal(_PIECES, 1, 1, 1)).exp()
         rays = rays + noise * examples.normal(*rays.shape)
@@ -121,7 +133,7 @@ class _Examples:
         """Return which joints are measured in each frame of the pieces."""
         kind, headless, blinking = self._uniform(3, _PIECES, 1)
         some = self._uniform(_PIECES, len(JOINTS)) < _KEPT
-        given = torch.where(kind < _WHOLE + _FEW, _END, some)
+        given = torch.where(kind < _WHOLE + _FEW, _GIVEN_OF_FEW, some)
         given = torch.where(kind < _WHOLE, torch.ones_like(given), given)
         given[:, _HEAD] &= headless[:, 0] >= _HEADLESS
         blinks = self._uniform(_PIECES, _FRAMES, len(JOINTS)) < _BLINK
@@ -134,10 +146,10 @@ class _Examples:
 def _loss(network: ArmLifter, seen: Tensor, ends: Float[Tensor, "N S 2 2 3"]) -> Tensor:
     """Return what is to be small: errors of bones and of hands, and how unlikely they are."""
     lifted: LiftedArms = network(seen)
-    off = (lifted.ends - ends) / 0.2
+    off = (lifted.ends - ends) / _UNIT
     bones_off = torch.stack([off[..., 0, :], off[..., 1, :] - off[..., 0, :], off[..., 1, :]])
     each = (bones_off.square().sum(-1) + 1e-6).sqrt()
-    log_std = (lifted.std / 0.2).log()
+    log_std = (lifted.std / _UNIT).log()
     unlikely = 3 * log_std + off.detach().square().sum(-1) / (2 * (2 * log_std).exp())
     return each[:2].mean() + each[2].mean() + _SPREAD_SHARE * unlikely.mean()
 

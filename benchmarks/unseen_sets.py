@@ -69,7 +69,6 @@ def leave_out(data: Path, name: str, quick: bool, kinds: Sequence[str] = LIFTERS
             steps, and the priors that come with torchpose. kinds: of lifters.
     """
     arms = shipped_arm_prior() if quick else bones.fit_without(data, name)
-    network = shipped_arm_lifter() if quick else arm_lifter.fit_without(data, name, arms)
     if name == _MHAD:
         views, few = bones.mhad_views(data, 150 if quick else 4), bones.FEW
         views = [bones.begun(view) for view in views] if quick else views
@@ -81,9 +80,9 @@ def leave_out(data: Path, name: str, quick: bool, kinds: Sequence[str] = LIFTERS
         prior, hand = fit_kinect_prior(others[:: 20 if quick else 1], seed=0, **bones.FIT), "hand"
     known = {other: share for other, share in bones.SETS.items() if other != name}
     known = {_ONE: known[_ONE]} if quick else known
-    sets = [
-        (share, bones.with_arms(bones.recordings(data / o))) for o, share in known.items() if kinds
-    ]
+    known = known if kinds or not quick else {}
+    sets = [(share, bones.with_arms(bones.recordings(data / o))) for o, share in known.items()]
+    network = shipped_arm_lifter() if quick else arm_lifter.fit_network(sets, arms)
     lifters = {kind: fit_lifter(kind, sets, arms, hand, quick) for kind in kinds}
     return Unseen(views, few, prior, arms, network, lifters)
 
