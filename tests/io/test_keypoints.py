@@ -611,8 +611,24 @@ def test_openpose_folder(tmp_path, joints):
     assert read.neck == "mid-shoulder"
 
 
+_FEET = ["big_toe", "small_toe", "heel"]
+
+
 @pytest.mark.parametrize(
-    ("joints", "names"), [(17, COCO), (26, COCO), (133, COCO), (33, LANDMARKS)]
+    ("joints", "names"),
+    [
+        (17, COCO),
+        (
+            26,
+            (
+                *COCO,
+                *3 * [None],
+                *(f"{side}_{point}" for point in _FEET for side in ("left", "right")),
+            ),
+        ),
+        (33, LANDMARKS),
+        (133, (*COCO, *(f"{side}_{point}" for side in ("left", "right") for point in _FEET))),
+    ],
 )
 def test_folders_of_other_joint_sets(tmp_path, joints, names):
     flat = np.stack([10 + np.arange(joints), np.full(joints, 5), np.full(joints, 0.9)], -1)
@@ -620,10 +636,12 @@ def test_folders_of_other_joint_sets(tmp_path, joints, names):
         tmp_path / "json", 4, {"pose_keypoints_2d": flat.ravel().tolist()}, person(1, 0.2, joints)
     )
     read = read_keypoints(tmp_path / "json")
-    assert read.names[: len(names)] == names
-    assert read.keypoints[0, : len(names), 0].tolist() == [10 + i for i in range(len(names))]
+    places = {name: 10 + i for i, name in enumerate(names) if name}
+    given = dict(zip(read.names, read.keypoints[0, :, 0].tolist(), strict=True))
+    assert {name: given[name] for name in places} == places
     everybody = read_openpose_people(tmp_path / "json")
-    assert everybody.names == names and everybody.keypoints.shape == (1, 2, len(names), 2)
+    assert everybody.names == tuple(places)
+    assert everybody.keypoints.shape == (1, 2, len(places), 2)
 
 
 _STANDING = {  # pixels

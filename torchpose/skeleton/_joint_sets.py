@@ -29,6 +29,21 @@ COCO = (
 )  # fmt: skip
 """The 17 keypoints of COCO, with which Halpe's 26 and the 133 of COCO-WholeBody begin."""
 
+WHOLE_BODY = (
+    *COCO, "left_big_toe", "left_small_toe", "left_heel",
+    "right_big_toe", "right_small_toe", "right_heel",
+)  # fmt: skip
+"""The keypoints of body and feet, with which the 133 of COCO-WholeBody begin."""
+
+_HALPE_FEET = (
+    "left_big_toe", "right_big_toe", "left_small_toe", "right_small_toe", "left_heel", "right_heel",
+)  # fmt: skip
+HALPE = dict(zip((*COCO, *_HALPE_FEET), (*range(17), *range(20, 26)), strict=True))
+"""The keypoints of body and feet among Halpe's 26, with their places.
+
+The three between are left out: the head is the crown, and neck and pelvis are middles.
+"""
+
 # --- names ----------------------------------------------------------------------------------------
 
 # canonical part: other words for it. Words are compared without case, blanks and punctuation.

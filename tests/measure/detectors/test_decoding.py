@@ -122,16 +122,19 @@ def test_hands_of_the_whole_body_are_beyond_the_wrists():
     points, confidence = torch.rand(2, 133, 2).double(), torch.rand(2, 133).double()
     joints = joint_set(133, "model")
     found = select_joints(Detections(points, confidence), joints)
-    assert found.keypoints.shape == (2, 19, 2)
+    assert found.keypoints.shape == (2, 25, 2)
     assert joints.names[-2:] == ("hand_left", "hand_right")
-    for hand, wrist, knuckle in ((17, 9, 100), (18, 10, 121)):
+    assert joints.names[19] == "left_heel" and torch.equal(found.keypoints[:, :23], points[:, :23])
+    for hand, wrist, knuckle in ((23, 9, 100), (24, 10, 121)):
         expected = 0.3 * points[:, wrist] + 0.7 * points[:, knuckle]
         torch.testing.assert_close(found.keypoints[:, hand], expected)
         least = confidence[:, [wrist, knuckle]].amin(1)
         torch.testing.assert_close(found.confidence[:, hand], least)
 
 
-def test_of_halpe_what_coco_has_is_taken():
+def test_of_halpe_what_coco_has_is_taken_and_the_feet():
     points, confidence = torch.rand(1, 26, 2).double(), torch.rand(1, 26).double()
-    found = select_joints(Detections(points, confidence), joint_set(26, "model"))
-    assert torch.equal(found.keypoints, points[:, :17])
+    joints = joint_set(26, "model")
+    found = select_joints(Detections(points, confidence), joints)
+    assert torch.equal(found.keypoints, torch.cat([points[:, :17], points[:, 20:]], 1))
+    assert joints.names[17] == "left_big_toe" and joints.names[-1] == "right_heel"

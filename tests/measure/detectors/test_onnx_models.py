@@ -37,18 +37,18 @@ def dotted(u, v):
 
 
 @pytest.mark.parametrize("make", [tiny.heatmaps, tiny.simcc])
-@pytest.mark.parametrize("n_joints", [17, 26])
-def test_a_model_of_crops_finds_the_bright_dot(make, n_joints, runtime, tmp_path):
+@pytest.mark.parametrize(("n_joints", "n_taken"), [(17, 17), (26, 23)])
+def test_a_model_of_crops_finds_the_bright_dot(make, n_joints, n_taken, runtime, tmp_path):
     model = load_onnx(make(tmp_path / "m.onnx", n_joints))
-    assert isinstance(model, CroppingOnnxModel) and model.names == COCO
+    assert isinstance(model, CroppingOnnxModel) and model.names[:17] == COCO
     dot = torch.tensor([100.0, 150.0])
     points, confidence = model(dotted(100, 150))
-    assert points.shape == (1, 17, 2) and confidence.shape == (1, 17)
+    assert points.shape == (1, n_taken, 2) and confidence.shape == (1, n_taken)
     assert float((points - dot).norm(dim=-1).max()) < 28  # the dot, and a cell of 27 pixels
     assert 0.1 < float(confidence.min()) <= 1.0
     boxes = torch.tensor([[40.0, 70, 160, 230], [60, 70, 180, 230]])
     close = model.detect_in(dotted(100, 150), boxes).keypoints
-    assert close.shape == (2, 17, 2)
+    assert close.shape == (2, n_taken, 2)
     assert float((close - dot).norm(dim=-1).max()) < 21  # in cells of 10
 
 

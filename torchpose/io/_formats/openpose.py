@@ -19,15 +19,16 @@ from torchpose._core.reading import check_span, read_json, reading
 from torchpose._core.wording import counted
 from torchpose.errors import FileFormatError, InputError, NobodySeenError
 from torchpose.io._formats.followed_person import follow_person
-from torchpose.skeleton._joint_sets import COCO, SKELETONS
+from torchpose.skeleton._joint_sets import COCO, HALPE, SKELETONS, WHOLE_BODY
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _SUFFIX = "_keypoints.json"
 _NAMES = f"*{_SUFFIX}, or *.json whose names end with the number of the frame"
-_LAYOUTS = {  # the first keypoints of everybody, by how many there are
-    25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints, 17: COCO, 26: COCO,
-    33: LANDMARKS, 133: COCO,
+_LAYOUTS = {  # what is taken of everybody's keypoints, by how many there are
+    25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints, 17: COCO,
+    26: tuple(HALPE), 33: LANDMARKS, 133: WHOLE_BODY,
 }  # fmt: skip
+_PLACES = {26: list(HALPE.values())}  # of others the first ones are taken
 _KNOWN = (
     "25 keypoints (BODY_25 or BODY_25B), 18 or 17 (COCO with and without a neck), 26 (Halpe), 33 (MediaPipe) "
     "or 133 (COCO-WholeBody)"
@@ -89,7 +90,8 @@ def read_openpose(folder: str | Path) -> OpenPosePerson:
 
     Returns:
         `OpenPosePerson`. BODY_25B has as many keypoints as BODY_25 in another order; where the necks and
-        hips are tells which it is. Of Halpe's 26 and the 133 of COCO-WholeBody the 17 of COCO are taken.
+        hips are tells which it is. Of Halpe's 26 and the 133 of COCO-WholeBody the 17 of COCO and the feet
+        are taken.
 
     Raises:
         InputError: no such files. NobodySeenError: nobody in any of them. FileFormatError: not OpenPose's
@@ -139,7 +141,8 @@ def _read_frames(
     everybody = [person for group in people.values() for person in group]
     names = _layout(folder, everybody, len(files))
     first = min(files)
-    taken = {frame: [one[: len(names)] for one in group] for frame, group in people.items()}
+    places = _PLACES.get(len(everybody[0]), list(range(len(names))))
+    taken = {frame: [one[places] for one in group] for frame, group in people.items()}
     frames = [taken.get(frame, []) for frame in range(first, max(files) + 1)]
     return frames, names, first, _notes_on_confidence(everybody)
 

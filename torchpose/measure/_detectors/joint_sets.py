@@ -1,5 +1,6 @@
 """Name the keypoints of models by how many there are, and make those that the tracker takes of them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -7,7 +8,7 @@ import torch
 from torchpose._core.rows import joined
 from torchpose.errors import InputError
 from torchpose.measure._detectors.protocol import Detections
-from torchpose.skeleton._joint_sets import COCO
+from torchpose.skeleton._joint_sets import COCO, HALPE, WHOLE_BODY
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 _HAND = 0.7  # of the way from the wrist to the knuckle of the middle finger, as with MediaPipe's index finger
@@ -18,20 +19,22 @@ class JointSet(NamedTuple):
     """Holds the selection among the keypoints of a model.
 
     Attributes:
-        title: of the set. names: of what is taken, of which the first keypoints of the model are the first.
+        title: of the set. names: of what is taken.
+        places: of these among the keypoints of the model, the first ones if None.
         hands: whether hands follow, made of wrists and knuckles.
     """
 
     title: str
     names: tuple[str, ...]
+    places: Sequence[int] | None = None
     hands: bool = False
 
 
 _SETS = {
     17: JointSet("COCO", COCO),
-    26: JointSet("Halpe", COCO),  # its head is the crown and its neck lies between the shoulders
+    26: JointSet("Halpe", tuple(HALPE), list(HALPE.values())),
     33: JointSet("MediaPipe", LANDMARKS),
-    133: JointSet("COCO-WholeBody", (*COCO, "hand_left", "hand_right"), hands=True),
+    133: JointSet("COCO-WholeBody", (*WHOLE_BODY, "hand_left", "hand_right"), hands=True),
 }
 KNOWN = frozenset(_SETS)
 """Numbers of keypoints that tell a set."""
@@ -65,11 +68,11 @@ def select_joints(found: Detections, joints: JointSet) -> Detections:
         found: all keypoints of the model.
     """
     points, confidence = found
-    n_first = len(joints.names) - (2 if joints.hands else 0)
-    first = Detections(points[:, :n_first], confidence[:, :n_first])
+    places = joints.places or list(range(len(joints.names) - 2 * joints.hands))
+    taken = Detections(points[:, places], confidence[:, places])
     if not joints.hands:
-        return first
+        return taken
     wrists = points[:, _WRISTS]
     hands = wrists + _HAND * (points[:, _KNUCKLES] - wrists)
     sure = torch.minimum(confidence[:, _WRISTS], confidence[:, _KNUCKLES])
-    return joined([first, Detections(hands, sure)], 1)
+    return joined([taken, Detections(hands, sure)], 1)
