@@ -129,6 +129,23 @@ def scene(tmp_path_factory):
     return folder, joints, points
 
 
+@pytest.mark.parametrize("everybody", [False, True])
+def test_keypoints_on_the_border_of_the_image_are_missing_and_a_note_counts_them(
+    scene, tmp_path, everybody
+):
+    _, _, points = scene
+    points = points[:3, 0].clone()
+    points[1, BODY_15.joint("left_knee"), 1] = (
+        HEIGHT  # as of a detector that clips what is beyond it
+    )
+    write_openpose(tmp_path / "json", points.numpy())
+    camera = looking_at("front", PLACES["front"])
+    found = read_body_keypoints([str(tmp_path / "json")], [camera], everybody=everybody)
+    missing = (found.confidence.reshape(3, -1) == 0).sum(1).tolist()
+    assert missing == [1, 2, 1]  # of the head there is no keypoint
+    assert any("1 keypoint on the border of the image counts as missing" in n for n in found.notes)
+
+
 def test_files_are_brought_in_step_by_their_numbers(scene, tmp_path):
     folder, _, points = scene
     cameras = list(load_cameras(folder / "cameras.toml").values())[:2]

@@ -1,5 +1,6 @@
 """Read the keypoints of a body in calibrated cameras: from files, or by a detector in videos."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.terminal import show_progress
-from torchpose._core.wording import numbered_frames
+from torchpose._core.wording import counted, numbered_frames
 from torchpose.cli._track import OTHER_TABLES, is_video
 from torchpose.errors import FileFormatError, InputError, NobodySeenError, SkeletonError
 from torchpose.skeleton._mediapipe_landmarks import count_given
@@ -360,12 +361,15 @@ def _read(
         missing = is_filled(people.keypoints) | ~(people.confidence > 0)
         table, notes = in_pixels(Path(path), people.keypoints, missing, size)
         trust = torch.from_numpy(people.confidence).masked_fill(torch.from_numpy(missing), 0.0)
-        of_body = _of_body(path, torch.from_numpy(table), trust, people.names)
-        return CameraKeypoints(*of_body, None, None, (*people.notes, *notes), first=people.first)
+        points, confidence, cut = _of_body(path, torch.from_numpy(table), trust, people.names, size)
+        notes = (*people.notes, *notes, *cut)
+        return CameraKeypoints(points, confidence, None, None, notes, first=people.first)
     found = read_keypoints(path, size)
-    points, confidence = _of_body(path, found.keypoints, found.confidence, found.names)
+    points, confidence, cut = _of_body(
+        path, found.keypoints, found.confidence, found.names, found.image_size or size
+    )
     derived = count_given(found.names) < len(found.names)  # joints that are not used here
-    notes = found.notes[:-1] if derived else found.notes
+    notes = (*(found.notes[:-1] if derived else found.notes), *cut)
     return CameraKeypoints(
         points[:, None], confidence[:, None], found.fps, found.image_size, notes, found.n_people,
         found.first_frame, found.first_time,
@@ -373,20 +377,31 @@ def _read(
 
 
 def _of_body(
-    source: str, points: Tensor, confidence: Tensor | None, names: Sequence[str]
-) -> tuple[Tensor, Tensor]:
-    """Return keypoints [..., 15, 2] and confidence [..., 15] of the joints of `BODY_15`, and of feet.
+    source: str,
+    points: Tensor,
+    confidence: Tensor | None,
+    names: Sequence[str],
+    size: tuple[int, int] | None,
+) -> tuple[Tensor, Tensor, tuple[str, ...]]:
+    """Return keypoints [..., 15, 2] and confidence [..., 15] of `BODY_15`'s joints, and of feet, and notes.
 
     Heads and necks that were put where the prior of the upper body has them are none of this body.
+
+    Args:
+        size: of the images, (width, height), None if it is not known.
     """
     from torchpose.body._feet import foot_points
     from torchpose.body._skeleton import body_joints
+    from torchpose.io._keypoints import is_on_border
 
-    there = torch.isfinite(points).all(-1)
-    trust = there.to(points) if confidence is None else confidence.to(points)
     given = count_given(names)
+    points = points[..., :given, :]
+    there = torch.isfinite(points).all(-1)
+    trust = there.to(points) if confidence is None else confidence[..., :given].to(points)
+    there &= trust > 0
+    cut = there & is_on_border(points, points.new_tensor(size or (math.inf, math.inf)))
     table = torch.cat([points, trust[..., None]], -1)
-    table = table.masked_fill(~(there & (trust > 0))[..., None], torch.nan)[..., :given, :]
+    table = table.masked_fill(~(there & ~cut)[..., None], torch.nan)
     try:
         joints = body_joints(table, names[:given])
     except SkeletonError as error:
@@ -394,7 +409,15 @@ def _of_body(
     feet = foot_points(table, names[:given])
     if feet is not None and bool(feet.isfinite().any()):
         joints = torch.cat([joints, feet], -2)
-    return joints[..., :2], joints[..., 2].nan_to_num(0.0)
+    return joints[..., :2], joints[..., 2].nan_to_num(0.0), _note_on_border(int(cut.sum()))
+
+
+def _note_on_border(count: int) -> tuple[str, ...]:
+    """Return a note on keypoints on the border of the image, if there are some."""
+    return (
+        f"{counted(count, 'keypoint')} on the border of the image count{'s' * (count == 1)} as missing: "
+        "detectors put there what is beyond it",
+    ) * (count > 0)
 
 
 def _detect(
@@ -412,8 +435,11 @@ def _detect(
             notes += others
             frames = [_of_person(frame, person) for frame in frames]
         points, confidence = _table(frames, len(measurer.names))
-        points, confidence = _of_body(settings.where, points, confidence, measurer.names)
-        return CameraKeypoints(points, confidence, source.fps, source.size, (*source.notes, *notes))
+        points, confidence, cut = _of_body(
+            settings.where, points, confidence, measurer.names, source.size
+        )
+        notes = (*source.notes, *notes, *cut)
+        return CameraKeypoints(points, confidence, source.fps, source.size, notes)
 
 
 def _note_on_cuts(frames: "Sequence[FrameKeypoints]") -> tuple[str, ...]:

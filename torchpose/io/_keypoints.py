@@ -45,6 +45,7 @@ from torchpose.skeleton._upper_body import NECK_KINDS, neck_of_detectors
 
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
+_BORDER = 0.5  # pixels from the middle of the last pixel to the edge of the image
 _MOST = 0.8  # share of coordinates that lie between 0 and 1 if they are shares of the image
 
 
@@ -311,6 +312,16 @@ _Points = TypeVar("_Points", np.ndarray, Tensor)
 def is_filled(points: _Points) -> _Points:
     """Return which keypoints [..., 2] are (0, 0) or (-1, -1), as detectors write where nothing was found."""
     return (points == 0).all(-1) | (points == -1).all(-1)
+
+
+def is_on_border(points: Tensor, size: Tensor) -> Tensor:
+    """Return which keypoints [..., 2] are on the border of the image, onto which detectors clip those beyond.
+
+    Args:
+        points: pixels. size: width and height [..., 2], infinite if they are not known.
+    """
+    last = (points - (size - _BORDER)).abs() <= _BORDER  # clipped to the last pixel, or to the size
+    return ((points == 0) | last).any(-1)
 
 
 def in_pixels(

@@ -856,6 +856,18 @@ def test_a_keypoint_that_no_image_can_have_is_missing(n_cameras):
     assert torch.equal(found, expected)
 
 
+@pytest.mark.parametrize(("axis", "border"), [(0, 0.0), (0, 1919.0), (0, 1920.0), (1, 1080.0)])
+def test_a_keypoint_on_the_border_of_the_image_is_missing(axis, border):
+    names, keypoints = NAMES[1:], scene(2, 1).keypoints[:, :, 1:]  # the pelvis is between the hips
+    hip = names.index("left_hip")
+    reader = kalman(ring(2)).by_keypoints.reader
+    keypoints[0, 0, hip, axis] = border  # as of a detector that clips what is beyond it
+    there = reader.frames_and_feet(keypoints, None, names, None)[0].there
+    assert (~there).nonzero().tolist() == [[0, 0, J("pelvis")], [0, 0, J("left_hip")]]
+    keypoints[0, 0, hip, axis] = border - 2 if border else 1.0
+    assert bool(reader.frames_and_feet(keypoints, None, names, None)[0].there.all())
+
+
 @pytest.mark.parametrize("persons", [None, "all"])
 def test_keypoints_of_larger_images_are_refused_by_a_single_camera(persons):
     given = scene(1, n_frames=12)
@@ -1003,6 +1015,7 @@ def test_names_of_a_stream_hold_for_all_frames(four):
         ({"confidence": lambda c: 100 * c}, InputError, "divide scores in percent by 100"),
         ({"confidence": lambda c: c.logit()}, InputError, "take the sigmoid of logits"),
         ({"keypoints": lambda k: k.repeat(1, 1, 2, 1)}, ShapeError, "BODY_15, whose names count"),
+        ({"keypoints": lambda k: k / 2500}, InputError, "must be in pixels"),
     ],
 )
 def test_what_keypoints_are_is_said(four, changes, error, said):

@@ -20,7 +20,7 @@ from torchpose.body._feet import foot_points
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.camera._rig import CameraRig
 from torchpose.errors import CameraError, InputError, ShapeError
-from torchpose.io._keypoints import is_filled
+from torchpose.io._keypoints import is_filled, is_on_border
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
 
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
@@ -52,6 +52,8 @@ class KeypointReader:
         self.rig, self.keypoint_std, self.pixel_std = rig, keypoint_std, pixel_std
         sides = [max(size or (_LONGEST_SIDE,)) for size in rig.sizes]
         self._farthest = _FARTHEST * torch.tensor(sides, dtype=torch.float64)[:, None, None]
+        known = [(math.inf, math.inf) if size is None else size[::-1] for size in rig.sizes]
+        self._sides = torch.tensor(known, dtype=torch.float64)[:, None]
 
     def frames_and_feet(
         self,
@@ -105,6 +107,7 @@ class KeypointReader:
         """Return how far keypoints are trusted, from 0, of those that are missing, to 1."""
         trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
         known = torch.isfinite(points).all(-1) & ~is_filled(points)
+        known &= ~is_on_border(points, self._sides.to(points))
         trust = torch.where(known, trust.nan_to_num(0.0, math.inf, -math.inf), 0.0)
         outside = (trust < 0) | (trust > MOST_CONFIDENCE)
         if bool(outside.any()):
@@ -150,8 +153,7 @@ class KeypointReader:
 
     def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
         """Refuse shares of an image, and keypoints most of which lie far outside it: of another size."""
-        sides = [(torch.inf, torch.inf) if size is None else size[::-1] for size in self.rig.sizes]
-        side = torch.tensor(sides).to(pixels)[:, None]
+        side = self._sides.to(pixels)
         there = pixels.isfinite().all(-1)
         check_pixels("keypoints", pixels, there)
         outside = ((pixels < -side / 2) | (pixels > 1.5 * side)).any(-1) & there
