@@ -683,6 +683,19 @@ def test_noise_does_not_hide_the_order_of_an_upper_body(tmp_path, layout):
     assert read_keypoints(tmp_path / "json").names == tuple(names)
 
 
+@pytest.mark.parametrize("nothing", [math.nan, None])
+def test_people_and_keypoints_that_are_no_numbers_are_missing(tmp_path, nothing):
+    folder = tmp_path / "json"
+    partly = standing(20, 0.9)
+    partly["pose_keypoints_2d"][4] = nothing  # of the second keypoint
+    frame(folder, 0, {"pose_keypoints_2d": 75 * [nothing]}, standing(10, 0.9))
+    frame(folder, 1, {"pose_keypoints_2d": 75 * [nothing]})
+    frame(folder, 2, partly)
+    read = read_keypoints(folder)
+    assert read.measured.sum(-1).tolist() == [25, 0, 24] and not read.measured[2, 1]
+    assert read.n_people.tolist() == [1, 0, 1]
+
+
 def test_the_most_confident_person_is_followed(tmp_path):
     folder = tmp_path / "json"
     frame(folder, 0)
@@ -770,7 +783,7 @@ def test_bad_openpose_folders(tmp_path):
 @pytest.mark.parametrize(
     "content",
     ["", "{", "[]", "3", '{"people": 3}', '{"people": [3]}', '{"people": [{}]}',
-     '{"people": [{"pose_keypoints_2d": "x"}]}', '{"people": [{"pose_keypoints_2d": [1, 2, NaN]}]}'],
+     '{"people": [{"pose_keypoints_2d": "x"}]}', '{"people": [{"pose_keypoints_2d": [1, 2, Infinity]}]}'],
 )  # fmt: skip
 def test_what_is_not_openposes_json(tmp_path, content):
     (tmp_path / "a_0_keypoints.json").write_text(content)

@@ -218,13 +218,17 @@ def _people(path: Path) -> list[np.ndarray]:
         arrays = [np.asarray(values, dtype=np.float64) for values in flat]
     people = []
     for array in arrays:
-        if array.ndim != 1 or array.size % 3 or not (np.abs(array) < _FAR).all():
+        known = array[~np.isnan(array)]
+        if array.ndim != 1 or array.size % 3 or not (np.abs(known) < _FAR).all():
+            most = np.abs(known).max(initial=0.0)
             raise FileFormatError(
                 f"{path}: pose_keypoints_2d must be x, y, confidence of each keypoint, below {_FAR:g}; "
-                f"got {array.size} values"
+                f"got {array.size} values up to {most:g}"
             )
-        if array.size and (array[2::3] > 0).any():
-            people.append(array.reshape(-1, 3))
+        person = array.reshape(-1, 3)
+        person[np.isnan(person).any(-1)] = 0.0  # Pose2Sim writes NaN for somebody who is not there
+        if (person[:, 2] > 0).any():
+            people.append(person)
     return people
 
 
