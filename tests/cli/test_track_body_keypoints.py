@@ -520,6 +520,15 @@ def test_lists_are_separated_by_blanks_or_commas():
     assert read(*files[:2], "--delays", "null")[1] is None
 
 
+def test_lists_behind_a_config_are_separated_by_blanks_too(tmp_path):
+    file = tmp_path / "track.yaml"
+    file.write_text("cameras: cameras.toml\ninputs: [a.npz, b.npz]\nout: out\ndelays: [1, 0]\n")
+    words = ["--config", str(file), "--camera-names", "a", "b", "--delays", "0", "3"]
+    values = command().given(words).values
+    assert (values["camera_names"], values["delays"]) == (["a", "b"], [0, 3])
+    assert (values["cameras"], values["inputs"]) == ("cameras.toml", ["a.npz", "b.npz"])
+
+
 def test_tables_that_are_no_cameras_are_said(torchpose, scene, tmp_path):
     text = (scene[0] / "cameras.toml").read_text() + "\n[charuco]\ncolumns = 4\n"
     (tmp_path / "config.toml").write_text(text)

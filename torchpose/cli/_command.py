@@ -165,8 +165,8 @@ def with_lists(
 ) -> list[str]:
     """Return arguments in which lists that are separated by commas or blanks are one word, as [a,b].
 
-    Blanks separate a list only where everything that is given by its place stands before all options:
-    another word behind an option can then be nothing else.
+    Blanks separate a list only where everything that is given by its place stands before all options, or
+    in the file of --config: another word behind an option can then be nothing else.
 
     Args:
         arguments: of a command. options: of it. by_place: how many words are given by their place, at least.
@@ -174,6 +174,7 @@ def with_lists(
     """
     lists = {option.flag for option in options if option.is_list and not option.spaced}
     leading = next((i for i, word in enumerate(arguments) if word.startswith("--")), 0)
+    placed = leading >= by_place or (leading == 0 and "--config" in arguments)
     words: list[str] = []
     rest = list(arguments)
     while rest:
@@ -181,7 +182,7 @@ def with_lists(
         if words[-1] not in lists or not rest or rest[0].startswith("--"):
             continue
         items = [rest.pop(0)]
-        while leading >= by_place and rest and not rest[0].startswith("--"):
+        while placed and rest and not rest[0].startswith("--"):
             items.append(rest.pop(0))
         one = len(items) == 1 and ("[" in items[0] or not (alone or "," in items[0]))
         words.append(items[0] if one else f"[{','.join(i.strip('[], ') for i in items)}]")
