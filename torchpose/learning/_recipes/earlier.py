@@ -4,13 +4,22 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Unpack
 
+import torch
+
+from torchpose._core.frame_rates import same_rate
 from torchpose.camera._viewpoints import ViewRange
 from torchpose.errors import InputError
 from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
-from torchpose.learning._training import RecordingLike
+from torchpose.learning._samplers import SampleSource
+from torchpose.learning._training import DEFAULT_RATE, RecordingLike
+from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout
+
+# nats: every second recording of the shipped prior's differs by 0.4, and bodies that are 5 % larger by 1.1
+_SAME_LIKELIHOOD = 0.1
+_SAMPLING = 4.0  # standard errors, where there are few states
 
 
 def fit_recipe_2(
@@ -53,17 +62,28 @@ def renew_noise(
         name, licence: instead of the prior's own. command: to be noted. progress: whether to show a bar.
 
     Raises:
-        InputError: recordings of other persons than the prior's.
+        InputError: other recordings than the prior's: of other persons, at another frame rate, with other
+            joints, or with other poses.
     """
     info = prior.info
-    persons = sorted({r.person_id for r in recordings})
-    if persons != sorted(info.persons):
-        raise InputError(
-            "the noise of a prior is learnt on the persons that it was fitted on, expected recordings "
-            f"of {', '.join(sorted(info.persons)) or 'nobody'}, got {', '.join(persons)}"
-        )
-    recipe = UpperBodyRecipe(
+    recipe = _recipe_of(prior, calibration_folds, drawn_pieces)
+    _check_recordings(prior, recipe, recordings)
+    kept = {name: v for name, v in prior.noise.items() if not name.startswith("process_cov")}
+    noise = kept | recipe.process_noise(prior, recordings)
+    info = replace(
+        info, name=name or info.name, licence=licence or info.licence,
+        extra=info.extra | {"noise": {"recipe": VERSION, "command": command}},
+    )  # fmt: skip
+    renewed = UpperBodyPrior(prior.left, prior.right, info, noise, prior.windows)
+    return recipe.calibrate(renewed, recordings, progress)
+
+
+def _recipe_of(prior: UpperBodyPrior, calibration_folds: int, drawn_pieces: int) -> UpperBodyRecipe:
+    """Return the recipe of a prior's mixtures over poses."""
+    info = prior.info
+    return UpperBodyRecipe(
         n_components=prior.n_components,
+        n_samples=info.n_samples or UpperBodyRecipe.n_samples,
         window_components=0,
         views=ViewRange(**info.views),
         calibration_folds=calibration_folds,
@@ -73,12 +93,76 @@ def renew_noise(
         rotation_order=info.rotation_order,
         neck=info.neck,
         mirror=info.mirrored,
+        nose_as_head=info.extra.get("head") == "nose",
     )
-    kept = {name: v for name, v in prior.noise.items() if not name.startswith("process_cov")}
-    noise = kept | recipe.process_noise(prior, recordings)
-    info = replace(
-        info, name=name or info.name, licence=licence or info.licence,
-        extra=info.extra | {"noise": {"recipe": VERSION, "command": command}},
-    )  # fmt: skip
-    renewed = UpperBodyPrior(prior.left, prior.right, info, noise, prior.windows)
-    return recipe.calibrate(renewed, recordings, progress)
+
+
+def _check_recordings(
+    prior: UpperBodyPrior, recipe: UpperBodyRecipe, recordings: Sequence[RecordingLike]
+) -> None:
+    """Raise `InputError` unless the prior was fitted to these recordings."""
+    info = prior.info
+    persons = sorted({r.person_id for r in recordings})
+    if persons != sorted(info.persons):
+        raise InputError(
+            "the noise of a prior is learnt on the persons that it was fitted on, expected recordings "
+            f"of {', '.join(sorted(info.persons)) or 'nobody'}, got {', '.join(persons)}"
+        )
+    other = _other_joints(prior, recordings) or _other_poses(prior, recipe, recordings)
+    if other:
+        raise InputError(
+            "the noise of a prior is learnt on the recordings that it was fitted to, "
+            f"{'; '.join(other)}; give those, with the same axes and curation, or fit a new prior"
+        )
+
+
+def _other_joints(prior: UpperBodyPrior, recordings: Sequence[RecordingLike]) -> list[str]:
+    """Return sentences on joints of a prior that no recording has, or has of another kind."""
+    nose = prior.info.extra.get("head") == "nose"
+    bodies = [r.upper_body(nose) for r in recordings]
+    wanted = {
+        "neck": prior.info.neck,
+        "hand": prior.info.hand,
+        "head": prior.info.extra.get("head"),
+    }
+    found = []
+    for joint, kind in wanted.items():
+        there = sorted({str(getattr(body, joint) or "unknown") for body in bodies})
+        if kind is not None and kind not in there:
+            found.append(
+                f"expected the {joint} to be of the kind {kind!r}, got {' and '.join(there)}"
+            )
+    return found
+
+
+def _other_poses(
+    prior: UpperBodyPrior, recipe: UpperBodyRecipe, recordings: Sequence[RecordingLike]
+) -> list[str]:
+    """Return sentences on how rate and states differ from those that the recipe fitted a prior to."""
+    found = []
+    facts = recipe.poses(recordings).facts
+    rate, own = (float(fps or DEFAULT_RATE) for fps in (prior.info.fps, facts["fps"]))
+    if not same_rate(rate, own):
+        found.append(f"expected {rate:g} frames per second, got {own:g}")
+    before = prior.info.extra.get("fit", {}).get("log_likelihood")
+    if before is not None:
+        now, error = _mean_likelihood(prior.left, recipe.tasks(recordings)["pose"].source)
+        if not abs(now - before) <= _SAME_LIKELIHOOD + _SAMPLING * error:
+            found.append(
+                f"expected poses with a log-likelihood of {before:.2f} nats under it, got {now:.2f} (other "
+                "poses, joints, units or axes)"
+            )
+    return found
+
+
+def _mean_likelihood(mixture: GaussianMixture, source: SampleSource) -> tuple[float, float]:
+    """Return the mean log density of the states of a source, nats, and its standard error."""
+    sums = torch.zeros(4, dtype=torch.float64)
+    for index in range(source.n_blocks):
+        states, weight = source.block(index)
+        density = mixture.log_prob(states)
+        powers = torch.stack([torch.ones_like(density), density, density.square()])
+        sums += torch.cat([powers @ weight, weight.square().sum()[None]])
+    total, first, second, squares = sums.tolist()
+    mean = first / total
+    return mean, max(second / total - mean**2, 0.0) ** 0.5 * squares**0.5 / total
