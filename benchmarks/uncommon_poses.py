@@ -86,7 +86,7 @@ def run(
     )  # fmt: skip
     for name, part in sets.items():
         s = scored[name]
-        errors = mean_error(s), mean_error(s, smoothed=True)
+        errors = mean_error(s), mean_error(s, "smoothed")
         table.add(name, [len(part), sum(map(len, part)), *errors, float(s.log_likelihood.mean())])
     add_pose_classes(report, scored)
     whole, without, control = (class_error(s, "raised") for s in scored.values())

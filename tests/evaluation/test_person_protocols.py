@@ -35,8 +35,8 @@ FRAMES = 26  # of a recording; completing joints takes a hundred of the persons 
 
 
 def recipe(recordings, n_components=2, calibration_folds=0, **options):
-    """`small_recipe` that takes the sizes of windows, which it has none of."""
-    for name in ("window_components", "window_samples"):
+    """`small_recipe` that takes the sizes of windows and of a calibration, which it has none of."""
+    for name in ("window_components", "window_samples", "drawn_pieces"):
         options.pop(name, None)
     return small_recipe(recordings, n_components, **options)
 
@@ -298,6 +298,54 @@ def test_persons_with_one_recording_have_no_prior_of_their_own(data, tmp_path, m
     assert own["the person's first half, on the person", "tests"] == 2  # s2, s8
     assert own["the person's first half, on others", "tests"] == 2
     assert any("with one recording only: s1, s7." in line for line in report.findings)
+    assert report["curve"]["1 person", "mean pose"] == pytest.approx(10.0)
+    assert own["the person's first half, on others", "mean pose"] == pytest.approx(10.0)
+
+
+def test_the_mean_pose_stands_beside_other_data_sets(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(cross_dataset, "run_jobs", made_up_scores)
+    folders = [
+        write_people(tmp_path / name, persons, n_frames=60, first=first)
+        for first, name, persons in ((0, "x", "ab"), (2, "y", "cd"))
+    ]
+    added = (str(data / "mocap_berkeley_mhad"),)
+    report = cross_dataset.run(folders, tmp_path / "out", progress=False, added=added)
+    for table, row in (("cross", "x → y (d)"), ("added", "x: alone")):
+        assert report[table][row, "mean pose"] == pytest.approx(10.0)
+        assert report[table][row, "filtered"] == pytest.approx(5.0)
+
+
+def test_no_filter_that_draws_is_calibrated(data, tmp_path, monkeypatch):
+    """None of them tracks the person who is left out."""
+    asked = []
+
+    def run_jobs(jobs, *_):
+        asked.extend(jobs)
+        return made_up_scores(jobs)
+
+    monkeypatch.setattr(leave_one_person_out, "run_jobs", run_jobs)
+    leave_one_person_out.run(data / "kinect_utd_mhad", tmp_path, progress=False)
+    assert {job.settings["calibration_folds"] for job in asked} == {6}
+    assert {job.settings["drawn_pieces"] for job in asked} == {0}
+
+
+def test_recordings_are_curated_as_for_a_fit(tmp_path):
+    """A hand that is elsewhere for a frame is neither fitted to nor scored; hands beside wrists are taken."""
+    folder = write_people(tmp_path, ("ann", "bob"), n_frames=FRAMES)
+    file = next(folder.glob("ann*"))
+    with np.load(file) as archive:
+        arrays = {key: archive[key].copy() for key in archive}
+    arrays["joints"][12, arrays["names"].tolist().index("left_hand")] += 1.5
+    np.savez(file, **arrays)
+    write_mocap(tmp_path / "mocap", ("carl",))
+    known = persons_module.read_known_persons(folder)
+    assert [len(r) for r in known.recordings] == [FRAMES, FRAMES, 40]
+    missing = known.recordings[0].upper_body().joints.isnan().any(-1).nonzero().tolist()
+    assert missing == [[12, UPPER_BODY.index("hand_left")]]
+    assert "Curation left out 1 joint (jump)" in known.notes[-1]
+    plain = persons_module.read_known_persons(folder, curated=False)
+    assert not plain.recordings[0].upper_body().joints.isnan().any()
+    assert not any("Curation" in note for note in plain.notes)
 
 
 def test_a_copy_is_not_in_the_other_half_of_a_person(data, tmp_path, monkeypatch):
@@ -306,8 +354,13 @@ def test_a_copy_is_not_in_the_other_half_of_a_person(data, tmp_path, monkeypatch
     shutil.copy(home / "s1_a01_t0.npz", home / "s1_a01_t9.npz")
     options = {"progress": False, "counts": (1,), "n_subsets": 1, "recipes": [("r", recipe)]}
     with pytest.raises(OverlapError, match=r"s1_a01_t9.*would be in the test"):
-        learning_curve.run(home, tmp_path / "out", **options)
-    learning_curve.run(home, tmp_path / "out", n_own=0, **options)
+        learning_curve.run(home, tmp_path / "out", curate=False, **options)
+    learning_curve.run(home, tmp_path / "out", n_own=0, curate=False, **options)
+    curated = learning_curve.run(home, tmp_path / "out", **options)
+    assert (
+        f"Curation left out {FRAMES} frames (duplicate); `torchpose fit` says"
+        in curated.findings[-1]
+    )
 
 
 def test_learning_curve_of_any_recordings(data, tmp_path):
@@ -344,7 +397,7 @@ def test_a_point_of_the_curve():
         {"a": scored(5.0), "c": scored(6.0)},
         {"a": scored(7.0), "b": scored(4.0)},
     ]
-    mean, drawn, tested = learning_curve._point(results, False)
+    mean, drawn, tested = learning_curve._point(results, "filtered")
     assert mean == pytest.approx((6 + 4 + 7) / 3)
     assert drawn == pytest.approx(math.sqrt((2 + 0 + 2) / 3))
     assert tested == pytest.approx(np.std([6, 4, 7], ddof=1))
@@ -466,7 +519,7 @@ def test_motion_capture_added_to_any_data_sets(data, tmp_path):
 
 
 def test_no_head_of_a_tested_person_is_learnt_from(data):
-    split = cross_dataset._crossed(cross_dataset._read([data], (), "cross"), (), 1)
+    split = cross_dataset._crossed(cross_dataset._read([data], (), "cross", True), (), 1)
     sets = cross_dataset._with_same_joints(split, 0)
     tested = {r.person_id for group in split["UTD"].tested.values() for r in group}
     assert sets.completion.persons and not set(sets.completion.persons) & tested

@@ -112,6 +112,7 @@ def run(
     window_samples: int | None = None,
     mocap_share: float = 1.0,
     every: int = 1,
+    curate: bool = True,
     workers: int = 1,
     fits: str | None = None,
     recipe: Recipe = fit_kinect_prior,
@@ -124,7 +125,7 @@ def run(
             kinect_laban, mocap_cmu_walk and mocap_cmu_actions.
         out: folder for the results.
         seed: the seed of priors, noise and made-up joints. progress: whether to show bars.
-        n_components, window_components, window_samples, every, workers, fits: see
+        n_components, window_components, window_samples, every, curate, workers, fits: see
             `torchpose.evaluation._leave_one_person_out.run`.
         quick: small priors and few sequences, to see that all of it works.
         part: the part to run: "cross", "added" (motion capture for training) or "both" (default).
@@ -146,7 +147,7 @@ def run(
     folders = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
     part = _part_of(part, len(folders), added)
     out = check_output_folder(out)
-    read = _read(folders, added, part)
+    read = _read(folders, added, part, curate)
     _check_tested(read, tested)
     folder = check_output_folder(fits or out)
     settings = fit_settings(
@@ -155,7 +156,7 @@ def run(
     scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
     common: dict[str, Any] = {"settings": settings, "recipe": recipe}
     report = Report("Across data sets", settings | {
-        "quick": quick, "every": scoring.every, "recipe": recipe.__qualname__, "part": part,
+        "quick": quick, "every": scoring.every, "curate": curate, "recipe": recipe.__qualname__, "part": part,
         "mocap share": mocap_share, "threads": torch.get_num_threads(), "workers": workers,
     })  # fmt: skip
     thin = 8 if quick else 1
@@ -236,7 +237,7 @@ def _recordings_of(persons: Mapping[str, list[Recording]]) -> list[Recording]:
     return [recording for group in persons.values() for recording in group]
 
 
-def _read(folders: Sequence[Path], added: Sequence[str], part: str) -> _DataSets:
+def _read(folders: Sequence[Path], added: Sequence[str], part: str, curated: bool) -> _DataSets:
     """Read all data sets that the parts need.
 
     Raises:
@@ -249,7 +250,7 @@ def _read(folders: Sequence[Path], added: Sequence[str], part: str) -> _DataSets
     else:
         sets, mocap = _named(folders), _named(added if part != "cross" else ())
     read = {
-        folder: read_known_persons(folder)
+        folder: read_known_persons(folder, curated)
         for folder in dict.fromkeys([*sets.values(), *mocap.values()])
     }
     refuse_shared_between_persons([r for found in read.values() for r in found.recordings])

@@ -8,6 +8,7 @@ import torch
 from torchpose.evaluation._person_recordings import spread
 from torchpose.evaluation._person_tables import (
     SHORT_NAMES,
+    TRACKED,
     add_pose_classes,
     mean_error,
 )
@@ -42,7 +43,8 @@ def add_cross(report: Report, found: Mapping[str, Mapping[str, Scored]], how: Cr
         report: gets the tables. found: by training set, then by the label of a person.
         how: the data sets were made alike.
     """
-    title, note = "3D error after Procrustes (cm)", "Joints: filtered."
+    title = "3D error after Procrustes (cm)"
+    note = "The mean pose is that of the prior. Joints: filtered."
     if how.wrists:
         title += ", wrists as hands"
     if how.completed:
@@ -52,8 +54,8 @@ def add_cross(report: Report, found: Mapping[str, Mapping[str, Scored]], how: Cr
             f"{' and '.join(how.donors)}'s training persons have theirs."
         )
     table = report.table(
-        "cross", title, ["persons", "frames", "filtered", "± persons", "smoothed", *SHORT_NAMES],
-        digits=(0, 0, 2, 2, 2, *[1] * 8), note=note,
+        "cross", title, ["persons", "frames", "mean pose", "filtered", "± persons", "smoothed", *SHORT_NAMES],
+        digits=(0, 0, 2, 2, 2, 2, *[1] * 8), note=note,
     )  # fmt: skip
     groups = {}
     for trained, scores in found.items():
@@ -70,11 +72,12 @@ def add_cross(report: Report, found: Mapping[str, Mapping[str, Scored]], how: Cr
     error = {name: mean_error(scored) for name, scored in groups.items()}
     for target in found:
         near = error[f"{target} → {target}"]
+        still = mean_error(groups[f"{target} → {target}"], "still")
         for other in [name for name in found if name != target]:
             far = error[f"{other} → {target}"]
             report.findings.append(
                 f"On {target}, a prior of {other} has {far:.2f} cm where one of {target} itself has "
-                f"{near:.2f} cm ({far - near:+.2f})."
+                f"{near:.2f} cm ({far - near:+.2f}). The mean pose of the latter is {still:.2f} cm off."
             )
 
 
@@ -82,7 +85,7 @@ def _row(persons: Mapping[str, Scored]) -> list[float | int]:
     whole = pooled(list(persons.values()))
     wide = spread([mean_error(s) for s in persons.values()])[1]
     joints = (100 * whole.filtered.double().nanmean(0)).tolist()
-    errors = [mean_error(whole), wide, mean_error(whole, smoothed=True)]
+    errors = [mean_error(whole, "still"), mean_error(whole), wide, mean_error(whole, "smoothed")]
     return [len(persons), len(whole.filtered), *errors, *joints]
 
 
@@ -100,15 +103,16 @@ def add_added(
         "added",
         "Motion capture with made-up heads and hands added to the training: 3D error (cm) on what "
         "was left out",
-        ["training frames", "frames", "filtered", "± persons", "smoothed", "log-lik."],
-        digits=(0, 0, 2, 2, 2, 2),
+        ["training frames", "frames", "mean pose", "filtered", "± persons", "smoothed", "log-lik."],
+        digits=(0, 0, 2, 2, 2, 2, 2),
+        note="The mean pose is that of the prior.",
     )
     groups: dict[str, Scored] = {}
     for (held, label), persons in found.items():
         whole = groups[f"{held}, {label}"] = pooled(list(persons.values()))
         row = _row(persons)
         table.add(f"{held}: {label}", [
-            frames[held, label], *row[1:5], float(whole.log_likelihood.mean()),
+            frames[held, label], *row[1:6], float(whole.log_likelihood.mean()),
         ])  # fmt: skip
     add_pose_classes(report, groups, "added_pose_classes")
     held_out = list(dict.fromkeys(held for held, _ in found))
@@ -116,11 +120,11 @@ def add_added(
     for label in labels[1:]:
         changes = [
             (
-                mean_error(groups[f"{held}, {label}"], late)
-                - mean_error(groups[f"{held}, {labels[0]}"], late)
+                mean_error(groups[f"{held}, {label}"], stage)
+                - mean_error(groups[f"{held}, {labels[0]}"], stage)
             )
             for held in held_out
-            for late in (False, True)
+            for stage in TRACKED
         ]
         each = "; ".join(
             f"{held} {changes[2 * i]:+.2f} filtered, {changes[2 * i + 1]:+.2f} smoothed"

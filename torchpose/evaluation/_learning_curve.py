@@ -31,7 +31,10 @@ from torchpose.evaluation._person_recordings import (
     spread,
 )
 from torchpose.evaluation._person_tables import (
+    STAGES,
+    TRACKED,
     Curve,
+    Stage,
     add_pose_classes,
     mean_error,
     plot_curves,
@@ -49,7 +52,6 @@ from torchpose.learning._recipes.upper_body import fit_kinect_prior
 _PUBLISHED, _FURTHER = "kinect_utd_mhad", ("burke_kinect", "kinect_laban")
 """Data sets that are taken from a folder that holds them, without being named."""
 _PUBLISHED_COUNTS = (1, 2, 4, 7, 9)
-STAGES = ("filtered", "smoothed")
 
 
 def run(
@@ -67,6 +69,7 @@ def run(
     window_components: int | None = None,
     window_samples: int | None = None,
     every: int = 1,
+    curate: bool = True,
     workers: int = 1,
     fits: str | None = None,
     compare: tuple[str, ...] = (),
@@ -79,7 +82,7 @@ def run(
             kinect_utd_mhad that is taken, with burke_kinect and kinect_laban beside it as `more`.
         out: folder for the results.
         seed: the seed of priors and noise. progress: whether to show bars.
-        n_components, window_components, window_samples, every, workers, fits: see
+        n_components, window_components, window_samples, every, curate, workers, fits: see
             `torchpose.evaluation._leave_one_person_out.run`.
         quick: small priors, few subsets and a tenth of the sequences, to see that all of it works.
         more: folders or files with further training persons, for counts beyond the persons of `data`
@@ -107,7 +110,7 @@ def run(
         raise InputError(
             f"recipes need names of their own, got {', '.join(name for name, _ in known)}; rename some"
         )
-    persons, others, counts, notes = _read(data, more, counts, quick)
+    persons, others, counts, notes = _read(data, more, counts, quick, curate)
     if quick:
         n_subsets, n_own = 2, min(1, n_own)
     settings = fit_settings(
@@ -121,9 +124,9 @@ def run(
     found = run_jobs([*jobs.values(), *own.values()], folder, workers, progress)
     scores = dict(zip([*jobs, *own], found, strict=True))
     report = Report("Learning curve over persons", settings | {
-        "quick": quick, "every": scoring.every, "counts": list(counts), "subsets": n_subsets,
+        "quick": quick, "every": scoring.every, "curate": curate, "counts": list(counts),
+        "subsets": n_subsets, "persons": list(persons), "further training persons": list(others),
         "recipes": {name: f"{r.__module__}.{r.__qualname__}" for name, r in known},
-        "persons": list(persons), "further training persons": list(others),
         "threads": torch.get_num_threads(), "workers": workers,
     })  # fmt: skip
     curves = _add_curve(report, [name for name, _ in known], counts, jobs, scores, len(persons))
@@ -137,8 +140,9 @@ def run(
             f"Not tested on a prior of their own, with one recording only: {', '.join(whole)}."
         )
     report.findings += notes
+    tracked: dict[str, dict[str, Curve]] = {stage: curves[stage] for stage in TRACKED}
     title = "Persons never seen: error over the number of training persons"
-    draw_picture(report, out, "learning-curve.png", lambda: plot_curves(curves, title))
+    draw_picture(report, out, "learning-curve.png", lambda: plot_curves(tracked, title))
     report.save(out)
     return report
 
@@ -205,10 +209,11 @@ def _read(
     more: Sequence[str],
     counts: tuple[int, ...],
     quick: bool,
+    curated: bool,
 ) -> _Persons:
     """Return the persons and the numbers of them that priors are fitted to, few for a quick run."""
     folders, further, usual = _sources(data, more)
-    recordings, notes = read_known_persons(folders)
+    recordings, notes = read_known_persons(folders, curated)
     persons = by_person(recordings)
     if len(persons) < 2:
         raise InputError(f"a learning curve needs two persons or more, got {', '.join(persons)}")
@@ -222,7 +227,7 @@ def _read(
     if quick:
         persons = {name: group[::5] for name, group in persons.items()}
         counts = tuple(c for c in counts if c in counts[:2])
-    others, more_notes = _further_persons(further, len(persons) - 1, max(counts))
+    others, more_notes = _further_persons(further, len(persons) - 1, max(counts), curated)
     refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
     return _Persons(persons, others, counts, [*notes, *more_notes])
 
@@ -251,13 +256,13 @@ def _doubling(most: int) -> tuple[int, ...]:
 
 
 def _further_persons(
-    folders: Sequence[Path], most: int, count: int
+    folders: Sequence[Path], most: int, count: int, curated: bool
 ) -> tuple[dict[str, list[Recording]], list[str]]:
     """Return the missing number of further training persons, and notes on their recordings."""
     missing = count - most
     if missing <= 0:
         return {}, []
-    recordings, notes = read_known_persons(folders) if folders else KnownPersons([], [])
+    recordings, notes = read_known_persons(folders, curated) if folders else KnownPersons([], [])
     others = by_person(recordings)
     if missing > len(others):
         raise InputError(
@@ -336,11 +341,11 @@ def _add_curve(
     table = report.table(
         "curve",
         "3D error after Procrustes (cm) on persons never seen, by number of training persons",
-        ["filtered", "± drawn", "± tested", "smoothed", "± drawn ", "± tested ", "log-lik.",
+        ["mean pose", "filtered", "± drawn", "± tested", "smoothed", "± drawn ", "± tested ", "log-lik.",
          "fits", "tests"],
-        digits=(2, 2, 2, 2, 2, 2, 2, 0, 0),
-        note="Mean over test persons of the mean over fits. Drawn: standard deviation over the fits "
-        "that track the same person; tested: over test persons. Beyond "
+        digits=(2, 2, 2, 2, 2, 2, 2, 2, 0, 0),
+        note="Mean over test persons of the mean over fits. The mean pose is that of the prior. Drawn: "
+        "standard deviation over the fits that track the same person; tested: over test persons. Beyond "
         f"{n_persons - 1} persons the further ones are of other data sets.",
     )  # fmt: skip
     curves: dict[str, dict[str, Curve]] = {stage: {} for stage in STAGES}
@@ -349,12 +354,13 @@ def _add_curve(
         for count in counts:
             results = [scores[key] for key in jobs if key[:2] == (recipe, count)]
             for stage in STAGES:
-                points[stage].append(_point(results, stage == "smoothed"))
+                points[stage].append(_point(results, stage))
             likelihood = [
                 float(s.log_likelihood.mean()) for found in results for s in found.values()
             ]
             table.add(f"{recipe}, {_people(count)}" if len(recipes) > 1 else _people(count), [
-                *points["filtered"][-1], *points["smoothed"][-1], spread(likelihood)[0],
+                points["still"][-1][0], *points["filtered"][-1], *points["smoothed"][-1],
+                spread(likelihood)[0],
                 len(results), sum(map(len, results)),
             ])  # fmt: skip
         for stage in STAGES:
@@ -367,12 +373,12 @@ def _people(count: int) -> str:
     return f"{count} person{'s' if count > 1 else ''}"
 
 
-def _point(results: Sequence[Mapping[str, Scored]], smoothed: bool) -> tuple[float, float, float]:
+def _point(results: Sequence[Mapping[str, Scored]], stage: Stage) -> tuple[float, float, float]:
     """Return mean, spread over fits (root mean of the variance within a person), spread over persons."""
     by_test: dict[str, list[float]] = {}
     for found in results:
         for name, scored in found.items():
-            by_test.setdefault(name, []).append(mean_error(scored, smoothed))
+            by_test.setdefault(name, []).append(mean_error(scored, stage))
     means = [spread(values)[0] for values in by_test.values()]
     variances = [spread(values)[1] ** 2 for values in by_test.values()]
     middle, tested = spread(means)
@@ -388,10 +394,10 @@ def _add_own(
     table = report.table(
         "own",
         "One person's prior against many (cm): tracked are the second halves of the recordings",
-        ["filtered", "± persons", "smoothed", "± persons ", "log-lik.", "tests"],
-        digits=(2, 2, 2, 2, 2, 0),
-        note="Halves by trial, so that no recording is in both. The spread is over the persons whom "
-        "the prior of one, or all but one, is made of.",
+        ["mean pose", "filtered", "± persons", "smoothed", "± persons ", "log-lik.", "tests"],
+        digits=(2, 2, 2, 2, 2, 2, 0),
+        note="Halves by trial, so that no recording is in both. The mean pose is that of the "
+        "prior. The spread is over the persons whom the prior of one, or all but one, is made of.",
     )
     recipes = list(dict.fromkeys(name for name, _, _ in own))
     rows = (
@@ -407,13 +413,13 @@ def _add_own(
                 for key in own
                 if key[0] == recipe and key[2] == kind
             ]
-            filtered, smoothed = (
-                spread([spread([mean_error(s, late) for s in group])[0] for group in found])
-                for late in (False, True)
+            still, filtered, smoothed = (
+                spread([spread([mean_error(s, stage) for s in group])[0] for group in found])
+                for stage in STAGES
             )
             likelihood = spread([float(s.log_likelihood.mean()) for g in found for s in g])[0]
             name = f"{recipe}: {label}" if len(recipes) > 1 else label
-            table.add(name, [*filtered, *smoothed, likelihood, sum(map(len, found))])
+            table.add(name, [still[0], *filtered, *smoothed, likelihood, sum(map(len, found))])
     values = [float(table[name, "filtered"]) for name in list(table.rows)[:4]]
     report.findings.append(
         f"A person is tracked with {values[0]:.2f} cm by a prior of other recordings of that person, "
@@ -440,13 +446,14 @@ def _add_classes(
 
 def _add_findings(report: Report, curves: Mapping[str, Mapping[str, Curve]]) -> None:
     for recipe, curve in curves["filtered"].items():
-        smooth = curves["smoothed"][recipe]
+        smooth, still = curves["smoothed"][recipe], curves["still"][recipe]
         if len(curve.counts) < 2:
             continue
         report.findings.append(
             f"{recipe}: from {curve.counts[0]} to {curve.counts[-1]} training persons the error "
             f"goes from {curve.mean[0]:.2f} to {curve.mean[-1]:.2f} cm filtered and from "
-            f"{smooth.mean[0]:.2f} to {smooth.mean[-1]:.2f} cm smoothed."
+            f"{smooth.mean[0]:.2f} to {smooth.mean[-1]:.2f} cm smoothed. The mean poses of these priors are "
+            f"{still.mean[0]:.2f} and {still.mean[-1]:.2f} cm off."
         )
     names = list(curves["filtered"])
     for name in names[1:]:

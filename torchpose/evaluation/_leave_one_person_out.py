@@ -45,6 +45,7 @@ def run(
     window_samples: int | None = None,
     calibration_folds: int = 6,
     every: int = 1,
+    curate: bool = True,
     workers: int = 1,
     fits: str | None = None,
     recipe: Recipe = fit_kinect_prior,
@@ -59,7 +60,9 @@ def run(
         window_components: the number of Gaussians per arm over windows; by default that of the recipe.
         window_samples: the number of training windows; by default that of the recipe.
         calibration_folds: the number of folds of the calibration; 0 leaves covariances uncalibrated.
-        every: track only each n-th sequence of a person. workers: the number of processes.
+        every: track only each n-th sequence of a person.
+        curate: leave out of recordings what jumps or is no body, as `torchpose fit` does, and say so.
+        workers: the number of processes.
         fits: the folder of fitted priors, to share them with other protocols; by default that of
             the results.
         recipe: fits the priors.
@@ -71,7 +74,7 @@ def run(
     check_count("every", every)
     check_count("workers", workers)
     out = check_output_folder(out)
-    recordings, notes = read_known_persons(data)
+    recordings, notes = read_known_persons(data, curate)
     persons = by_person(recordings)
     if len(persons) < 2:
         raise InputError(
@@ -96,7 +99,7 @@ def run(
     found = run_jobs(jobs, check_output_folder(fits or out), workers, progress)
     scored = {name: result[name] for name, result in zip(persons, found, strict=True)}
     report = Report("Leave one person out", settings | {
-        "quick": quick, "every": scoring.every, "recipe": recipe.__qualname__,
+        "quick": quick, "every": scoring.every, "curate": curate, "recipe": recipe.__qualname__,
         "persons": {name: counted(len(group), "recording") for name, group in persons.items()},
         "threads": torch.get_num_threads(), "workers": workers,
     })  # fmt: skip

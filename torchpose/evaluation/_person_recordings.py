@@ -1,6 +1,7 @@
 """Recordings of persons: who is who, which frames are whole, and what arms do in them."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from torchpose.io._recordings import (
     notes_on_unread_files,
     read_recordings,
 )
+from torchpose.learning._curation.curate import CurationSettings, curate
 from torchpose.learning._curation.joints import measured, runs
 from torchpose.learning._curation.splits import same_names, unstated_rates
 
@@ -27,6 +29,7 @@ LEAST_FRAMES = 10
 POSE_CLASSES = ("raised", "crossed", "near the body", "reaching out")
 """What an arm does in a frame (`pose_classes`)."""
 
+_CURATION = CurationSettings(person_frames=0)  # a short recording may still be scored
 _HANDS, _SHOULDERS = (0, 7), (2, 5)
 _NEAR = 0.2  # metres
 
@@ -63,11 +66,17 @@ class KnownPersons(NamedTuple):
     notes: list[str]
 
 
-def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons:
+def read_known_persons(
+    paths: Sequence[str | Path] | str | Path, curated: bool = True
+) -> KnownPersons:
     """Read recordings, without other people in a person's file: nobody says who they are.
+
+    Args:
+        paths: folders or files. curated: leave out what is no body, as `torchpose fit` does.
 
     Raises:
         InputError, FileFormatError, SkeletonError, MissingDependencyError: as `read_recordings`.
+        InputError, OverlapError: as `curate`.
     """
     found = find_recordings(paths)
     recordings = read_recordings(found)
@@ -83,7 +92,28 @@ def read_known_persons(paths: Sequence[str | Path] | str | Path) -> KnownPersons
     for doubt in DOUBTS:
         found_in = [note for r in known for note in r.notes if note.startswith(doubt)]
         notes += [f"In {len(found_in)} of {len(known)} recordings: {n}." for n in found_in[:1]]
-    return KnownPersons(known, notes)
+    return _curated(known, notes) if curated and known else KnownPersons(known, notes)
+
+
+def _curated(recordings: Sequence[Recording], notes: Sequence[str]) -> KnownPersons:
+    """Return curated recordings in their order; a note says how much was left out.
+
+    Kinds of hands and heads are curated apart: curation refuses them mixed, for a fit.
+    """
+    kinds: dict[Any, list[Recording]] = {}
+    for recording in recordings:
+        body = recording.upper_body()
+        kinds.setdefault((body.hand, body.head), []).append(recording)
+    found = [curate(group, _CURATION) for group in kinds.values()]
+    left_out: Counter[tuple[str, str]] = Counter()
+    for one in found:
+        for reason, (count, what) in one.report.totals().items():
+            left_out[reason, what.removesuffix("s")] += count
+    listed = ", ".join(f"{counted(n, what)} ({why})" for (why, what), n in sorted(left_out.items()))
+    said = [
+        f"Curation left out {listed}; `torchpose fit` says where, and --curate false leaves all of it in."
+    ] * bool(left_out)
+    return KnownPersons([r for one in found for r in one.recordings], [*notes, *said])
 
 
 def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:

@@ -1,9 +1,10 @@
 """Tables and pictures of the protocols over persons."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor
 
 from torchpose.evaluation._person_recordings import POSE_CLASSES, spread
 from torchpose.evaluation._report import Report, Table
@@ -13,13 +14,20 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 SHORT_NAMES = tuple(name.replace("_left", " L").replace("_right", " R") for name in UPPER_BODY)
 """Names of the joints at the heads of columns."""
 
+Stage = Literal["still", "filtered", "smoothed"]
+TRACKED: tuple[Stage, ...] = ("filtered", "smoothed")
+"""Errors of `Scored` in tracking, without and with later frames."""
+
+STAGES: tuple[Stage, ...] = ("still", *TRACKED)
+"""The same, after those of the mean pose."""
+
 _COLUMNS = ("filtered", "smoothed", "in 50 %", "in 90 %", "log-lik.")
 _HANDS, _ELBOWS = (0, 7), (1, 6)
 
 
-def mean_error(scored: Scored, smoothed: bool = False) -> float:
-    """Return the mean over all joints and frames, centimetres."""
-    errors = scored.smoothed if smoothed else scored.filtered
+def mean_error(scored: Scored, stage: Stage = "filtered") -> float:
+    """Return the mean over all joints and frames of tracking, or of the mean pose, centimetres."""
+    errors: Tensor = getattr(scored, stage)
     return 100 * float(errors.double().nanmean())
 
 
@@ -49,8 +57,7 @@ def _row(scored: Scored) -> list[float | int]:
     low, high = (100 * scored.inside.double().nanmean((0, 2))).tolist()
     joints = (100 * scored.filtered.double().nanmean(0)).tolist()
     likelihood = float(scored.log_likelihood.nanmean())
-    still = 100 * float(scored.still.double().nanmean())
-    errors = still, mean_error(scored), mean_error(scored, smoothed=True)
+    errors = [mean_error(scored, stage) for stage in STAGES]
     return [len(scored.filtered), *errors, low, high, likelihood, *joints]
 
 
@@ -100,10 +107,11 @@ def plot_persons(persons: Mapping[str, Scored], title: str) -> Any:
     figure = new_figure(max(6.4, 0.62 * len(persons) + 2.8), 3.9, title)
     ax = style_axes(figure.add_subplot(), y="mean 3D error (cm)")
     ax.grid(False, axis="x")
-    styles = method_styles(["filtered", "smoothed"])
+    styles = method_styles(list(TRACKED))
     entries: list[Any] = []
-    for i, (stage, style) in enumerate(styles.items()):
-        values = [mean_error(scored, stage == "smoothed") for scored in persons.values()]
+    for i, stage in enumerate(TRACKED):
+        style = styles[stage]
+        values = [mean_error(scored, stage) for scored in persons.values()]
         middle, wide = spread(values)
         place = torch.arange(len(values)).double().numpy() - 0.2 + 0.4 * i
         ax.bar(place, values, 0.36, color=style["color"], alpha=0.85)

@@ -75,6 +75,7 @@ def run(
     joints: Literal["head+hands", "all"] = "head+hands",
     noise_std: float = 3.0,
     every: int = 1,
+    curate: bool = True,
     seen: bool = False,
 ) -> Report:
     """Score a prior and a tracker; writes report.json, report.md and a picture to `out`.
@@ -87,6 +88,7 @@ def run(
         joints: what the tracker is given: head, neck and hands, or all eight.
         noise_std: the standard deviation of a keypoint, pixels (default 3).
         every: use only each n-th recording of a person.
+        curate: leave out of recordings what jumps or is no body, as `torchpose fit` does, and say so.
         seen: score also persons whom the prior, or the prior over arms that comes with the package, was
             fitted on; the report says so.
 
@@ -101,7 +103,7 @@ def run(
     _check(method, joints, noise_std, every)
     out = check_output_folder(out)
     prior = load_prior("kinect-upper-body") if prior is None else prior
-    recordings, notes = read_known_persons(data)
+    recordings, notes = read_known_persons(data, curate)
     scored = {r.person_id for r in recordings}
     usual = _usual(prior, _SEEN[joints])
     in_arms = _known_to_arms(scored, method or usual)
@@ -115,7 +117,7 @@ def run(
         found[name] = _score(prior, name, group, method, _SEEN[joints], noise_std, seed)
     report = Report("A prior and a tracker on recordings", {
         "prior": prior.info.name, "method": method or f"default ({usual})", "joints": joints, "seed": seed,
-        "noise_std": noise_std, "every": every, "persons the prior was fitted on": known,
+        "noise_std": noise_std, "every": every, "curate": curate, "persons the prior was fitted on": known,
         "persons": {name: counted(len(group), "recording") for name, group in persons.items()},
     })  # fmt: skip
     _add_joints(report, found)
@@ -244,7 +246,7 @@ def _add_joints(report: Report, found: Mapping[str, _PersonScores]) -> None:
 
 def _add_findings(report: Report, found: Mapping[str, _PersonScores], known: Sequence[str]) -> None:
     errors = [mean_error(scores.scored) for scores in found.values()]
-    still = [100 * float(scores.scored.still.double().nanmean()) for scores in found.values()]
+    still = [mean_error(scores.scored, "still") for scores in found.values()]
     (mean, wide), (base, _) = spread(errors), spread(still)
     persons = counted(len(found), "person")
     deviation = f" ± {wide:.2f}" if len(found) > 1 else ""

@@ -128,7 +128,10 @@ def fit_settings(
     window_samples: int | None,
     calibration_folds: int,
 ) -> dict[str, Any]:
-    """Return the settings of a recipe: the given ones, small sizes for a quick run, else its own."""
+    """Return the settings of a recipe: the given ones, small sizes for a quick run, else its own.
+
+    The filters that draw, which no protocol tracks with, are not calibrated.
+    """
     settings: dict[str, Any] = {"name": name, "seed": seed}
     settings |= QUICK if quick else {}
     sizes = {
@@ -137,7 +140,8 @@ def fit_settings(
         "window_samples": window_samples,
     }
     settings |= {key: value for key, value in sizes.items() if value is not None}
-    return settings | {"calibration_folds": 0 if quick else calibration_folds}
+    settings["calibration_folds"] = 0 if quick else calibration_folds
+    return settings | ({"drawn_pieces": 0} if settings["calibration_folds"] else {})
 
 
 def run_jobs(
