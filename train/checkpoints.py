@@ -12,6 +12,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from torchpose._core.files import atomic_path, check_output_folder, hold_folder
 from torchpose.errors import FileFormatError, InputError, OutputError
+from torchpose.io._results import set_aside
 
 __all__ = [
     "ENTRY",
@@ -37,6 +38,8 @@ def checkpoint_file(folder: str | Path) -> Path:
 
 class LastCheckpoint(Checkpoint):
     """A checkpoint of the whole fit after every step, in `checkpoints/last.ckpt`.
+
+    That of an earlier fit, which this one does not take up, is moved to `earlier-1` (or 2, ...) beside it.
 
     Attributes:
         written: whether this run has written one; there may be one of an earlier run.
@@ -79,9 +82,27 @@ class LastCheckpoint(Checkpoint):
             self._lock = None
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write the checkpoint."""
-        trainer.save_checkpoint(checkpoint_file(trainer.default_root_dir))
+        """Write the checkpoint; a trial of one step is no fit, and writes none."""
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
+        file = checkpoint_file(trainer.default_root_dir)
+        if trainer.is_global_zero and not self.written and not _taken_up(trainer, file):
+            _set_earlier_aside(file)
+        trainer.save_checkpoint(file)
         self.written = True
+
+
+def _taken_up(trainer: Trainer, file: Path) -> bool:
+    """Return whether a fit goes on from a file."""
+    given = trainer.ckpt_path
+    return given is not None and Path(given).exists() and file.samefile(given)
+
+
+def _set_earlier_aside(file: Path) -> None:
+    if file.exists():
+        print(
+            f"note     the checkpoint of an earlier fit was moved to {set_aside(file)}", flush=True
+        )
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

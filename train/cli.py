@@ -113,9 +113,10 @@ def _reason(error: BaseException, arguments: list[str]) -> str | None:
         return missing and (
             f"training needs {missing}; run `python -m pip install -e '.[train]'` in the checkout"
         )
-    from train.refusals import reason
+    from train.refusals import is_full, reason
 
-    return reason(error, arguments)
+    text = reason(error, arguments)
+    return f"{text}; once there is room, {_how_to_go_on()}" if text and is_full(error) else text
 
 
 def _stop(stopped: signal.Signals, how: str) -> int:

@@ -1,10 +1,12 @@
 """Run `python -m train fit` and `select`: their arguments and defaults."""
 
+import contextlib
 import logging
 import os
 import shlex
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,26 +60,44 @@ def run(arguments: Sequence[str]) -> None:
     register_strategy()
     _Command.arguments, _Command.kept, _Command.resumed = list(arguments), None, False
     quiet: dict[str, Any] = {"exit_on_error": False}
-    _Command(
-        LightningModule,
-        LightningDataModule,
-        subclass_mode_model=True,
-        subclass_mode_data=True,
-        trainer_class=SelectingTrainer,
-        trainer_defaults=_DEFAULTS,
-        seed_everything_default=0,
-        auto_configure_optimizers=False,
-        load_from_checkpoint_support=False,
-        parser_kwargs={**quiet, "prog": "python -m train", "fit": quiet, "select": quiet},
-        args=_Command.arguments,
-    )
+    with _log_errors_said_once():
+        _Command(
+            LightningModule,
+            LightningDataModule,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            trainer_class=SelectingTrainer,
+            trainer_defaults=_DEFAULTS,
+            seed_everything_default=0,
+            auto_configure_optimizers=False,
+            load_from_checkpoint_support=False,
+            parser_kwargs={**quiet, "prog": "python -m train", "fit": quiet, "select": quiet},
+            args=_Command.arguments,
+        )
+
+
+@contextlib.contextmanager
+def _log_errors_said_once() -> Iterator[None]:
+    """Keep the thread that writes TensorBoard's file from printing an error that the next log raises."""
+    before = threading.excepthook
+
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        of_logs = type(failed.thread).__module__.startswith("tensorboard")
+        if not (of_logs and isinstance(failed.exc_value, OSError)):
+            before(failed)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def how_to_go_on() -> str:
     """Return how to go on after a command was stopped, in words."""
     if _Command.resumed or (_Command.kept is not None and _Command.kept.written):
         return "go on with --ckpt_path last, which takes up the fit after its last step"
-    return "no step was finished: run the same command again"
+    return "run the same command again, as no step was finished"
 
 
 class SelectingTrainer(Trainer):

@@ -15,7 +15,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from torchpose._core.terminal import one_line
 from torchpose.errors import TorchposeError
 
-__all__ = ["reason"]
+__all__ = ["is_full", "reason"]
 
 _UNKNOWN = (
     r"Option '(?P<key>[^']+)' is not accepted",
@@ -28,9 +28,8 @@ _CLASS = r"Problem with given class_path '[^']+':\s*"
 _KEY = r'Parser key "([\w.]+)":\s*'
 _SETTINGS = "accelerator_connector"  # where Lightning looks at devices and strategies
 _SEED = "seed.py"  # where it looks at seeds
-_REFUSED = (  # by the system: rights, a full disk
-    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENOSPC, errno.EPERM, errno.EROFS,
-)  # fmt: skip
+_FULL = (errno.EDQUOT, errno.EFBIG, errno.ENOSPC)
+_REFUSED = (*_FULL, errno.EACCES, errno.EIO, errno.EPERM, errno.EROFS)  # by the system
 
 
 def reason(error: BaseException, arguments: Sequence[str]) -> str | None:
@@ -55,6 +54,12 @@ def reason(error: BaseException, arguments: Sequence[str]) -> str | None:
     if isinstance(error, torch.distributed.DistError) or "gloo" in str(error):
         return "another process has gone, see its messages; go on with --ckpt_path last"
     return None
+
+
+def is_full(error: BaseException) -> bool:
+    """Return whether an error comes from a disk that is full."""
+    cause = error if type(error) is OSError else error.__cause__
+    return isinstance(cause, OSError) and cause.errno in _FULL
 
 
 def _of_arguments(text: str, arguments: Sequence[str]) -> str:

@@ -14,6 +14,9 @@ import torch
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
+from lightning.pytorch import Callback
+
+from tests.full_disk import files_up_to
 from tests.train.people import RECIPE, WINDOWS, settings, write_recordings, write_settings
 from torchpose._core.files import hold_folder
 from torchpose.io import read_recordings
@@ -145,6 +148,7 @@ def test_a_trial_of_one_step_replaces_no_prior(fitted, tmp_path, capsys):
     assert main([*line, "--trainer.default_root_dir", str(tmp_path)]) == 0
     assert f"{fitted / 'p.safetensors'} is not written" in capsys.readouterr().out
     assert (fitted / "p.safetensors").read_bytes() == before
+    assert not list(tmp_path.rglob("*.ckpt"))
 
 
 OTHER = {
@@ -189,6 +193,22 @@ def test_two_fits_do_not_share_checkpoints(fitted, recordings, tmp_path, capsys)
     assert main([*line, "--trainer.max_epochs", "0"]) == 2  # let in again, and again after an error
     assert main([*line, "--trainer.max_epochs", "0"]) == 2
     assert "the trainer took no step" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_fit_begun_anew_keeps_the_checkpoint_of_the_earlier_one(recordings, tmp_path, capsys):
+    values = settings(recordings, tmp_path, calibration_folds=0)
+    line = ["fit", "--config", str(write_settings(tmp_path, values)), "--trainer.max_epochs"]
+    folder = tmp_path / "runs" / "checkpoints"
+    assert main([*line, "1"]) == 0
+    assert main([*line, "2", "--ckpt_path", "last"]) == 0  # goes on, and writes over its own
+    assert [p.name for p in folder.iterdir()] == ["last.ckpt"]
+    before = (folder / "last.ckpt").read_bytes()
+    capsys.readouterr()
+    assert main([*line, "1"]) == 0
+    kept = folder / "earlier-1" / "last.ckpt"
+    assert kept.read_bytes() == before != (folder / "last.ckpt").read_bytes()
+    assert f"the checkpoint of an earlier fit was moved to {kept}" in capsys.readouterr().out
 
 
 def test_early_stopping_on_held_out_persons_stays_stopped(recordings, tmp_path):
@@ -298,7 +318,30 @@ def test_what_cannot_be_read_or_written_is_said(recordings, tmp_path, monkeypatc
     assert main(["fit", "--config", str(config)]) == 2
     printed = capsys.readouterr().err
     assert printed == (
-        "train: error: metrics.csv: cannot be read or written (No space left on device)\n"
+        "train: error: metrics.csv: cannot be read or written (No space left on device); once there is room, "
+        "run the same command again, as no step was finished\n"
+    )
+
+
+def test_a_disk_that_fills_up_with_logs_is_said_once(recordings, tmp_path, capfd):
+    values = settings(recordings, tmp_path, calibration_folds=0)
+    line = ["fit", "--config", str(write_settings(tmp_path, values))]
+
+    class FillsUp(Callback):
+        def on_train_epoch_end(self, trainer, module):
+            writer = trainer.loggers[1].experiment
+            with files_up_to(10):
+                writer.add_text("notes", 1000 * "x")
+                writer.flush()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.command.StopAtOnce", FillsUp)
+        assert main(line) == 2
+    printed = capfd.readouterr().err
+    assert "Traceback" not in printed
+    assert (
+        "train: error: logs: cannot be read or written (File too large); once there is room, run"
+        in printed
     )
 
 

@@ -82,7 +82,7 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
     if when == "calibration":
         assert said == GO_ON.format("terminated" if code == 143 else "interrupted")
     else:
-        assert "no step was finished: run the same command again" in said
+        assert "run the same command again, as no step was finished" in said
     assert len(said.splitlines()) == 1
     assert {p.name for p in tmp_path.iterdir()} <= {"fit.yaml", "runs"}
     for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):

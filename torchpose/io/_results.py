@@ -210,8 +210,18 @@ def replace_own(path: str | Path, kind: str) -> Iterator[Path]:
         with as_output_error(path), _locked_folder(path.parent):
             listed = _read_list(path.parent, kind) or {}
             if os.path.lexists(path) and not _is_listed(path, listed):
-                path.rename(_free_folder(path.parent, [path.name]) / path.name)
+                set_aside(path)
             _write_list(path.parent, kind, listed | {path.name: _facts(temporary)})
+
+
+def set_aside(path: Path) -> Path:
+    """Move a file to a folder `earlier-1` (or 2, ...) beside it; return where it is then.
+
+    Raises:
+        OutputError: it cannot be moved.
+    """
+    with as_output_error(path):
+        return path.rename(_free_folder(path.parent, [path.name]) / path.name)
 
 
 def refuse_stranger(path: str | Path, kind: str, earlier: bool = False) -> None:
