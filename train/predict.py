@@ -8,6 +8,7 @@ so nothing is computed twice and the next run resumes.
 
 import contextlib
 import os
+import re
 import sys
 import time
 from argparse import ArgumentError
@@ -23,6 +24,7 @@ from torchpose._core.terminal import one_line, show_progress
 from torchpose._core.wording import counted
 from torchpose.errors import InputError, OutputError, TorchposeError
 from torchpose.upper_body._keypoint_files import TrackSettings
+from train.argument_errors import configuration_files, describe_argument_error
 from train.predict_claims import Claim, Claims, Run
 from train.predict_recordings import KeypointRecording, find_keypoints, share
 from train.predict_summary import (
@@ -68,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ArgumentError, TorchposeError) as error:
         if debug:
             raise
-        print(f"train: error: {one_line(error)}", file=sys.stderr)
+        print(f"train: error: {_reason(error, arguments)}", file=sys.stderr)
         return 2
     print(f"process {rank} of {world}: {count_outcomes(outcomes)}")
     if rank == 0:
@@ -76,6 +78,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"train: warning: {line}", file=sys.stderr)
         print(f"summary  {Path(options.out) / SUMMARY}")
     return 0 if all(outcome.good for outcome in outcomes.values()) else 1
+
+
+def _reason(error: BaseException, arguments: Sequence[str]) -> str:
+    """Return what was wrong, in one sentence."""
+    text = one_line(error)
+    if not isinstance(error, ArgumentError) or text.startswith("missing: "):
+        return _as_typed(text)
+    if "does not support item assignment" in text:
+        files = ", ".join(map(str, configuration_files(arguments)))
+        return f"{files}: recordings: expected a list, such as [keypoints/]"
+    return describe_argument_error(str(error), arguments, "predict")
+
+
+def _as_typed(text: str) -> str:
+    """Return a message with the options of `torchpose track` as they are typed here.
+
+    >>> _as_typed("expected --camera FILE or --camera-name NAME")
+    'expected --track.camera FILE or --track.camera_name NAME'
+    """
+
+    def typed(option: re.Match[str]) -> str:
+        name = option[1].replace("-", "_")
+        return f"--track.{name}" if name in TrackSettings.__dataclass_fields__ else option[0]
+
+    return re.sub(r"--([a-z][a-z-]*)", typed, text)
 
 
 def build() -> ArgumentParser:
@@ -232,7 +259,8 @@ class Batch(NamedTuple):
             raise
         except Exception as error:  # one bad recording does not stop the others
             typed = isinstance(error, TorchposeError)
-            text = one_line(error) if typed else f"{type(error).__name__}: {one_line(error)}"
+            text = _as_typed(one_line(error))
+            text = text if typed else f"{type(error).__name__}: {text}"
             claim.record("failed", origin=origin, error=text, final=typed, run=self.run.id)
             return Outcome(recording.name, "failed", error=text)
         claim.record("finished")

@@ -25,7 +25,7 @@ __all__ = [
 COLUMNS = ("recording", "state", "frames", "fps", "seconds", "log_evidence",
            "log_evidence_per_frame", "missing", "failed_at", "took_seconds", "error")  # fmt: skip
 OTHER = "no recording"
-_SHOWN = 5  # files that are none
+_SHOWN = 5  # of what failed, and of files that are no recordings
 _WORDS = {"made": "made", "found": "made before or by others", "failed": "failed"}
 
 
@@ -107,11 +107,15 @@ def count_outcomes(outcomes: Mapping[str, Outcome]) -> str:
 
 
 def name_others(outcomes: Mapping[str, Outcome]) -> list[str]:
-    """Say which files are no recordings, the first few of them, and why."""
-    others = [outcomes[name] for name in sorted(outcomes) if outcomes[name].state == OTHER]
-    lines = [f"no recording: {other.recording}: {other.error}" for other in others[:_SHOWN]]
-    if len(others) > _SHOWN:
-        lines.append(f"no recordings: {len(others) - _SHOWN} more files, which the summary lists")
+    """Say which recordings failed and which files are none, the first few of each, and why."""
+    return [line for state in ("failed", OTHER) for line in _named(outcomes, state)]
+
+
+def _named(outcomes: Mapping[str, Outcome], state: str) -> list[str]:
+    found = [outcomes[name] for name in sorted(outcomes) if outcomes[name].state == state]
+    lines = [f"{state}: {one.recording}: {one.error}" for one in found[:_SHOWN]]
+    if len(found) > _SHOWN:
+        lines.append(f"{state}: {len(found) - _SHOWN} more, which the summary lists")
     return lines
 
 

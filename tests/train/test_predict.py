@@ -133,7 +133,12 @@ def test_bad_recordings_are_listed_and_do_not_stop_the_others(data, prior_file, 
     said = capsys.readouterr()
     assert "9 recordings: 7 made, 2 failed" in said.out
     other, reason = str(data / "other.npz"), "expected an array keypoints or joints2d, got joints"
-    assert said.err.strip() == f"train: warning: no recording: {other}: {reason}"
+    lines = said.err.strip().splitlines()
+    assert [line.split(": ")[2:4] for line in lines[:2]] == [
+        ["failed", "broken"],
+        ["failed", "empty"],
+    ]
+    assert lines[2:] == [f"train: warning: no recording: {other}: {reason}"]
     table = rows(out)
     assert (table[other]["state"], table[other]["error"]) == ("no recording", reason)
     assert list(table) == sorted(table) and tuple(table["a"]) == COLUMNS
@@ -221,7 +226,42 @@ def test_what_suits_no_recording_is_refused_before_any_work(data, prior_file, tm
     config = tmp_path / "wrong.yaml"
     config.write_text(f"recordings: ['{data}']\nout: {out}\ntrack:\n  smothing: full\n")
     assert main(["--config", str(config)]) == 2
-    assert "smothing" in capsys.readouterr().err
+    assert "wrong.yaml: there is no key track.smothing" in capsys.readouterr().err
+
+
+REFUSED = {
+    "camera": (["--track.camera_name", "left"], "--track.camera_name chooses one of several"),
+    "tilt": (["--track.tilt", "200"], "--track.tilt must lie between -90 and 90"),
+    "deviation": (["--track.measurement_std", "0"], "got 0.0; it is how far keypoints are off, in pixels"),
+    "keypoints": (["--track.person", "{data}/a.npz"], "a.npz: expected poses of the person, got keypoints"),
+    "recording": (["--track.person", "{data}/other.npz"], "; give the poses.npz of an earlier recording"),
+    "unknown": (["--track.foo", "3"], "there is no key track.foo; `python -m train predict --print_config`"),
+    "number": (["--track.roll", "much"], "train: error: track.roll: Expected a float, got much\n"),
+    "list": (["--config", "{data}/one.yaml"], "one.yaml: recordings: expected a list, such as [keypoints/]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_errors_name_options_as_they_are_typed(case, data, prior_file, tmp_path, capsys) -> None:
+    (data / "one.yaml").write_text(f"recordings: {data}\n")
+    options, message = REFUSED[case]
+    options = [option.format(data=data) for option in options]
+    line = [str(data / "a.npz"), "--out", str(tmp_path / "out"), "--track.prior", prior_file]
+    line += ["--track.method", "articulated"] if "--track.person" in options else []
+    assert main([*line, *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out" / "a.npz").exists()
+
+
+def test_errors_of_a_recording_name_options_as_they_are_typed(data, prior_file, tmp_path) -> None:
+    write_recording(data / "unknown.npz", 5)
+    arrays = {
+        k: v for k, v in np.load(data / "unknown.npz").items() if k not in ("K", "image_size")
+    }
+    np.savez(data / "unknown.npz", **arrays)
+    settings = TrackSettings(prior=prior_file)
+    (outcome,) = predict([data / "unknown.npz"], tmp_path / "out", settings).values()
+    assert "expected --track.camera FILE or --track.camera fx,fy,cx,cy" in outcome.error
 
 
 def test_the_config_in_the_repository_is_complete() -> None:
@@ -337,7 +377,7 @@ def test_a_folder_with_a_file_that_is_no_recording_is_not_done(data, prior_file,
     said = capsys.readouterr()
     assert "1 recording: 1 made before" in said.out
     assert "bad4.csv: expected a column frame, got time, price" in said.err
-    assert "no recordings: 1 more files, which the summary lists" in said.err
+    assert "no recording: 1 more, which the summary lists" in said.err
     (folder / "a.npz").unlink()
     assert main(arguments) == 2
     assert "found none in" in (said := capsys.readouterr().err) and "got time, price" in said

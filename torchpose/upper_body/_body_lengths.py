@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_height, number_of
-from torchpose.errors import InputError
+from torchpose.errors import FileFormatError, InputError
+from torchpose.io._results import holds_arrays
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.upper_body._estimator import Bones
 from torchpose.upper_body._pose_track import PoseTrack
@@ -146,7 +147,7 @@ class BodyLengths:
             raise InputError(
                 f"person must be a PoseTrack or the path of its file, got {type(person).__name__}"
             )
-        track = person if isinstance(person, PoseTrack) else PoseTrack.load(person)
+        track = person if isinstance(person, PoseTrack) else _poses_of(person)
         if len(track) != 1:
             raise InputError(
                 f"person must be poses of one sequence, got {len(track)}; see PoseTrack.sequence"
@@ -296,6 +297,19 @@ class BodyLengths:
             slope = both * expected * (seen - expected) / variance
             found.append((slope, both * expected.square() / variance))
         return found[0], found[1]
+
+
+def _poses_of(path: str | Path) -> PoseTrack:
+    """Return the poses in a file; errors say what to give instead of a file of another kind."""
+    try:
+        return PoseTrack.load(path)
+    except FileFormatError as error:
+        if holds_arrays(path, ["keypoints"]):
+            raise FileFormatError(
+                f"{path}: expected poses of the person, got keypoints; track them with method 'articulated', "
+                "and give the poses.npz of that"
+            ) from error
+        raise FileFormatError(f"{error}; give the poses.npz of an earlier recording") from error
 
 
 def _check_one_size(known: KnownBody) -> None:

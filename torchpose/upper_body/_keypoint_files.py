@@ -232,13 +232,14 @@ class KeypointFileTracker:
         """
         settings = self.settings
         UpperBodyTracker(self.prior, self.prior.camera, **self._options, neck=settings.neck)
-        if settings.camera:
+        if settings.camera or settings.camera_name:
             camera, _ = resolve_camera(
                 settings.camera, settings.camera_name, None, None, settings.camera
             )
             settings.hold(camera)
         else:
-            settings.hold(self.prior.camera)
+            info = self.prior.info
+            settings.hold(PinholeCamera(info.fx, info.fy, info.cx, info.cy))
 
     def prepare(self, keypoints: Keypoints) -> PreparedTracker:
         """Return the tracker of a file, and what was assumed.

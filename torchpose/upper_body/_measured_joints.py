@@ -460,8 +460,10 @@ def joint_covariances(
     check_shape("measurement_std", by_joint, [5])
     check_finite("measurement_std", by_joint)
     if bool((by_joint <= 0).any()):
+        advice = STAYS_POSITIVE if by_joint.requires_grad else "leave it out where it is not known"
         raise InputError(
-            f"measurement_std must be positive, got {given.tolist()}; {STAYS_POSITIVE}"
+            f"measurement_std must be positive, got {given.tolist()}; it is how far keypoints are off, in "
+            f"pixels, mostly 1 to 10: {advice}"
         )
     cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
     if learnt is None:
