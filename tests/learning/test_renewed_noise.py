@@ -37,6 +37,10 @@ def test_a_frame_that_is_left_out_makes_no_others(prior):
 
 
 OTHERS = {
+    "fewer frames": (
+        {"joints": lambda joints: joints[:190]},
+        "expected 400 frames with a whole arm, got 380",
+    ),
     "twice the rate": ({"fps": 60.0}, "expected 30 frames per second, got 60"),
     "wrists": ({"names": WRISTS}, "the hand to be of the kind 'hand', got wrist"),
     "another neck": (
@@ -58,3 +62,9 @@ def test_other_recordings_of_the_same_persons_are_refused(prior, case):
     others = [replace(RECORDED[0], **changed), replace(RECORDED[1], **changed)]
     with pytest.raises(InputError, match=message):
         renew_noise(prior, others, calibration_folds=0)
+
+
+def test_other_numbers_of_recordings_are_refused(prior):
+    halves = [replace(RECORDED[0], joints=part) for part in RECORDED[0].joints.split(100)]
+    with pytest.raises(InputError, match="expected 2 recordings, got 3"):
+        renew_noise(prior, [*halves, RECORDED[1]], calibration_folds=0)

@@ -7,18 +7,21 @@ from typing import Unpack
 import torch
 
 from torchpose._core.frame_rates import same_rate
+from torchpose._core.wording import counted
 from torchpose.camera._viewpoints import ViewRange
 from torchpose.errors import InputError
 from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
 from torchpose.learning._samplers import SampleSource
-from torchpose.learning._training import DEFAULT_RATE, RecordingLike
+from torchpose.learning._training import DEFAULT_RATE, RecordingLike, arm_poses
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout
+from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
 # nats: every second recording of the shipped prior's differs by 0.4, and bodies that are 5 % larger by 1.1
 _SAME_LIKELIHOOD = 0.1
+_SAME_FRAMES = 0.01  # share of them that another curation may leave out
 _SAMPLING = 4.0  # standard errors, where there are few states
 
 
@@ -138,13 +141,20 @@ def _other_joints(prior: UpperBodyPrior, recordings: Sequence[RecordingLike]) ->
 def _other_poses(
     prior: UpperBodyPrior, recipe: UpperBodyRecipe, recordings: Sequence[RecordingLike]
 ) -> list[str]:
-    """Return sentences on how rate and states differ from those that the recipe fitted a prior to."""
+    """Return sentences on how counts, rate and states differ from those that the recipe fitted a prior to."""
     found = []
-    facts = recipe.poses(recordings).facts
-    rate, own = (float(fps or DEFAULT_RATE) for fps in (prior.info.fps, facts["fps"]))
-    if not same_rate(rate, own):
-        found.append(f"expected {rate:g} frames per second, got {own:g}")
-    before = prior.info.extra.get("fit", {}).get("log_likelihood")
+    poses, info = recipe.poses(recordings), prior.info
+    count, own = info.extra.get("recordings", len(recordings)), len(recordings)
+    if count != own:
+        found.append(f"expected {counted(count, 'recording')}, got {own}")
+    known = [arm_poses(poses, arm).known for arm in (LEFT_ARM, RIGHT_ARM)]
+    frames = int((known[0] | known[1]).sum())
+    if info.n_frames and abs(frames - info.n_frames) > _SAME_FRAMES * info.n_frames:
+        found.append(f"expected {counted(info.n_frames, 'frame')} with a whole arm, got {frames}")
+    usual, rate = (float(fps or DEFAULT_RATE) for fps in (info.fps, poses.facts["fps"]))
+    if not same_rate(usual, rate):
+        found.append(f"expected {usual:g} frames per second, got {rate:g}")
+    before = info.extra.get("fit", {}).get("log_likelihood")
     if before is not None:
         now, error = _mean_likelihood(prior.left, recipe.tasks(recordings)["pose"].source)
         if not abs(now - before) <= _SAME_LIKELIHOOD + _SAMPLING * error:
