@@ -32,6 +32,7 @@ from train.predict_summary import (
     Outcome,
     check_summary,
     count_outcomes,
+    name_notes,
     name_others,
     write_summary,
 )
@@ -76,6 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if rank == 0:
         for line in name_others(outcomes):
             print(f"train: warning: {line}", file=sys.stderr)
+        for note in name_notes(outcomes):
+            print(f"note     {_as_typed(note)}")
         print(f"summary  {Path(options.out) / SUMMARY}")
     return 0 if all(outcome.good for outcome in outcomes.values()) else 1
 

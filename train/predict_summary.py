@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchpose._core.files import atomic_path
-from torchpose._core.wording import counted
+from torchpose._core.wording import alike_once, counted
 from torchpose.errors import OutputError
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Outcome",
     "check_summary",
     "count_outcomes",
+    "name_notes",
     "name_others",
     "write_summary",
 ]
@@ -109,6 +110,12 @@ def count_outcomes(outcomes: Mapping[str, Outcome]) -> str:
 def name_others(outcomes: Mapping[str, Outcome]) -> list[str]:
     """Say which recordings failed and which files are none, the first few of each, and why."""
     return [line for state in ("failed", OTHER) for line in _named(outcomes, state)]
+
+
+def name_notes(outcomes: Mapping[str, Outcome]) -> list[str]:
+    """Say what was assumed of recordings and is doubtful about them, the most frequent first."""
+    notes = [note for o in outcomes.values() if o.facts for note in o.facts.get("notes", ())]
+    return alike_once(notes)[:_SHOWN]
 
 
 def _named(outcomes: Mapping[str, Outcome], state: str) -> list[str]:

@@ -130,7 +130,7 @@ def read_origin(path: Path, known: bool = True) -> dict[str, Any] | None:
 
 
 def facts_of(track: PoseTrack, started: float) -> dict[str, Any]:
-    """Return what the summary says about a result.
+    """Return what is said about a result.
 
     Args:
         started: `time.monotonic()` before the work.
@@ -147,6 +147,7 @@ def facts_of(track: PoseTrack, started: float) -> dict[str, Any]:
         "missing": 1.0 - float(observed[:, measured].mean()),
         "failed_at": int(track.failed_at[0]),
         "took_seconds": round(time.monotonic() - started, 3),
+        "notes": list(track.notes),
     }
 
 

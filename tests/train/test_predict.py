@@ -253,6 +253,21 @@ def test_errors_name_options_as_they_are_typed(case, data, prior_file, tmp_path,
     assert not (tmp_path / "out" / "a.npz").exists()
 
 
+def test_what_was_assumed_is_said_also_of_results_that_are_there(
+    data, prior_file, tmp_path, capsys
+):
+    for name in ("a", "b"):
+        arrays = {k: v for k, v in np.load(data / f"{name}.npz").items() if k != "fps"}
+        np.savez(data / f"{name}.npz", **arrays)
+    line = [str(data / "a.npz"), str(data / "b.npz"), "--out", str(tmp_path / "out")]
+    for _ in range(2):
+        assert main([*line, "--track.prior", prior_file]) == 0
+        said = capsys.readouterr().out
+        assert (
+            "note     the keypoint file states no frame rate: 30 fps assumed (2 recordings)" in said
+        )
+
+
 def test_errors_of_a_recording_name_options_as_they_are_typed(data, prior_file, tmp_path) -> None:
     write_recording(data / "unknown.npz", 5)
     arrays = {

@@ -1,6 +1,9 @@
 """Word lists and counts in messages."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+
+_NUMBERS = re.compile(r"\d[\d.]*(?:(?:, |-)\d[\d.]*)*(?: and \d+ more places)?")
 
 
 def first_of(names: Sequence[object], most: int, between: str = ", ") -> str:
@@ -29,3 +32,19 @@ def counted(count: int, one: str, several: str = "") -> str:
     ('1 camera', '2 cameras', '1 frame is')
     """
     return f"{count} {one if count == 1 else several or f'{one}s'}"
+
+
+def alike_once(notes: Iterable[str]) -> list[str]:
+    """Return notes on recordings, those that differ in numbers once, with how many recordings have them.
+
+    >>> alike_once(["25 fps assumed", "no camera", "30 fps assumed"])
+    ['25 fps assumed (2 recordings, numbers of the first)', 'no camera (1 recording)']
+    """
+    alike: dict[str, list[str]] = {}
+    for note in notes:
+        alike.setdefault(_NUMBERS.sub("#", note), []).append(note)
+    first = ", numbers of the first"
+    return [
+        f"{same[0]} ({counted(len(same), 'recording')}{first * (len(set(same)) > 1)})"
+        for same in sorted(alike.values(), key=len, reverse=True)
+    ]

@@ -1,6 +1,5 @@
 """Split persons into training and test without leaks: duplicates, shared recordings, kinds of joints."""
 
-import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.wording import counted, first_of
+from torchpose._core.wording import alike_once, first_of
 from torchpose.errors import InputError, OverlapError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import label, measured
@@ -20,7 +19,6 @@ _SHARED = 0.5  # of the shorter recording's frames
 _MOST_COPIES = 64  # of one frame that are compared
 _NECK = 4
 _MISSING = -(2**40)
-_NUMBERS = re.compile(r"\d[\d.]*(?:(?:, |-)\d[\d.]*)*(?: and \d+ more places)?")
 
 
 class Duplicate(NamedTuple):
@@ -162,14 +160,7 @@ def notes_of_reading(recordings: Iterable[Recording]) -> list[str]:
     Pieces of one recording count as one.
     """
     whole = {(r.path or id(r), r.companion): r for r in recordings}
-    alike: dict[str, list[str]] = {}
-    for note in (note for r in whole.values() for note in r.notes):
-        alike.setdefault(_NUMBERS.sub("#", note), []).append(note)
-    first = ", numbers of the first"
-    return [
-        f"{same[0]} ({counted(len(same), 'recording')}{first * (len(set(same)) > 1)})"
-        for same in sorted(alike.values(), key=len, reverse=True)
-    ]
+    return alike_once(note for r in whole.values() for note in r.notes)
 
 
 def unstated_rates(recordings: Iterable[Recording]) -> list[str]:
