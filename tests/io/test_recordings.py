@@ -312,6 +312,21 @@ def test_find_recordings(tmp_path):
     assert notes_on_unread_files(found, find_recordings(found)) == []
 
 
+def test_archives_under_other_keys_are_said(tmp_path):
+    """The recordings of a person were missing from fits without a word."""
+    write(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", positions=pose(), joint_names=np.array(["head"]))
+    np.savez(tmp_path / "keypoints.npz", keypoints=np.zeros(3))
+    [note] = notes_on_unread_files(tmp_path, find_recordings(tmp_path))
+    expected = (
+        f"no arrays joints and names: {tmp_path / 'b.npz'}; the first has positions, joint_names"
+    )
+    assert note == f"not read, since they hold {expected}"
+    (tmp_path / "a.npz").unlink()
+    with pytest.raises(InputError, match=r"found none in .*; not read, .* the first has positions"):
+        find_recordings(tmp_path)
+
+
 def test_nothing_found(tmp_path):
     with pytest.raises(InputError, match="found none"):
         find_recordings(tmp_path)

@@ -66,7 +66,13 @@ _BACK_TO_CAMERA = (
 DOUBTS = (LIES, MIRRORED, _BACK_TO_CAMERA)
 """How notes begin on recordings whose axes or sides are perhaps wrong."""
 _BESIDE_BODY = 0.3  # most distance of a centred body's origin from its joints, over their extent
-_SHOWN_JOINTS, _LISTED = 3, 2  # joints, and files, that a note names
+_SHOWN_JOINTS, _LISTED, _SHOWN_KEYS = 3, 2, 6  # joints, files and arrays that a note names
+_NO_RECORDINGS = (
+    "keypoints",
+    "joints2d",
+    "joints3d",
+    "state",
+)  # arrays of keypoints, and of results
 _BACK = 2 * math.pi / 3  # radians of the mean heading, from which on the back is to the camera
 _FAR = 1e9  # in the unit of the file; no joint is there
 
@@ -265,6 +271,7 @@ def find_recordings(paths: str | Path | Iterable[str | Path]) -> list[Path]:
         raise InputError(
             f"expected recordings of 3D joints ({', '.join(_SUFFIXES)}), found none in "
             f"{', '.join(map(str, given)) or 'no paths at all'}"
+            + "".join(f"; {note}" for note in notes_on_unread_files(given, ()))
         )
     return list(dict.fromkeys(found))
 
@@ -284,11 +291,17 @@ def notes_on_unread_files(
         for f in dict.fromkeys(files)
         if f not in read and f.name[0] != "." and f.name != _AXES_FILE
     ]
+    nameless = [f for f in unread if f.suffix.lower() == ".npz" and _holds_something_else(f)]
     unread = [f for f in unread if f.suffix.lower() in _SUFFIXES[1:]]
     archives = {f.parent for f in read if f.suffix.lower() == ".npz"}
     beside = [f for f in unread if f.parent in archives]
     other = [f for f in unread if f.parent not in archives]
     notes = []
+    if nameless:
+        notes.append(
+            f"not read, since they hold no arrays joints and names: {first_of(nameless, _LISTED)}; the first "
+            f"has {first_of(npz_keys(nameless[0]), _SHOWN_KEYS)}"
+        )
     if beside:
         notes.append(
             f"not read, since the folder holds recordings as .npz: {first_of(beside, _LISTED)}; if they "
@@ -322,6 +335,11 @@ def _may_hold_joints(path: Path) -> bool:
         return {"joints", "names"} <= set(npz_keys(path))
     except (FileFormatError, InputError):
         return True  # reading it gives the error
+
+
+def _holds_something_else(path: Path) -> bool:
+    """Return whether a readable .npz holds neither joints, nor keypoints, nor results of tracking."""
+    return not (_may_hold_joints(path) or any(known in npz_keys(path) for known in _NO_RECORDINGS))
 
 
 def looks_recorded(path: Path) -> bool:
