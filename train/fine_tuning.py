@@ -334,7 +334,7 @@ class FineTuning(LightningModule):
         }
         given = {name: value for name, value in facts.items() if value}
         # errors of the recipe that the mixtures came from, not of this prior
-        of_recipe = ("held_out", "held_out_drawn")
+        of_recipe = ("held_out", "held_out_drawn", "held_out_still")
         extra = {name: value for name, value in info.extra.items() if name not in of_recipe}
         if "calibrated" in extra:
             extra["calibrated"] = sorted(n for n in prior.noise if n.startswith("calibration"))

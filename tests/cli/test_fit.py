@@ -74,10 +74,16 @@ def test_the_recipe_holds_persons_out_and_says_what_to_expect(torchpose, files, 
     wanted = recipe.fit(curate(read_recordings(folder)).recordings)
     torch.testing.assert_close(prior.left.means, wanted.left.means, rtol=0, atol=0)
     assert set(prior.info.extra["held_out"]["pose"]) == {"recordings#p1", "recordings#p2"}
+    still = prior.info.extra["held_out_still"]
+    assert set(still) == {"recordings#p1", "recordings#p2"} and min(still.values()) > 0.02
     assert prior.info.licence == "CC0" and "measurement_std" in prior.noise
     assert "kept     2 recordings of 2 persons, 300 frames" in done.out
     card = out.with_suffix(".md").read_text()
     assert "On persons that it was not fitted on" in card and "| recordings#p2 |" in card
+    assert "| person | mean pose | single poses |" in card
+    assert (
+        f"expect   {50 * sum(still.values()):.1f} cm of the mean pose, without looking" in done.out
+    )
     assert prior.info.extra["curation"]["after"]["frames"] == 300
 
 

@@ -152,6 +152,26 @@ def test_held_out_persons_are_tracked_at_the_rates_of_their_recordings(monkeypat
     assert len(held_out(fast, drawn=1)["mkf_sampled"].errors) == 40  # as long as 20 of the prior
 
 
+def test_errors_of_the_mean_pose_on_held_out_persons():
+    """Of somebody who stands in it, turned, and of somebody whose left hand is 8 cm elsewhere."""
+    prior = fit_upper_body_prior([recording()], 2, n_samples=400)
+    mean = prior.mean_pose().double()
+    turned = mean @ rotate(torch.tensor([0.1, -0.2, 0.3]).double()).mT
+    other = mean.clone()
+    other[0, 2] += 0.08
+    people = [
+        recording(pose.expand(n, 8, 3), who)
+        for who, pose, n in (("a", turned, 20), ("b", other, 30))
+    ]
+    of_all = collect_poses(people)
+    found = calibration.still_poses(prior, of_all, {"site:set#a", "site:set#b"})
+    assert found.persons.count("site:set#b") == 30
+    errors = found.error_by_person()
+    assert errors["site:set#a"] == pytest.approx(0.0, abs=1e-9)
+    assert errors["site:set#b"] == pytest.approx(0.01, abs=1e-9)  # of eight joints
+    assert calibration.still_poses(prior, of_all, {"nobody"}) is None
+
+
 def film(n_frames, seed, fps=30.0):
     """The performer of the demonstration, in front of the camera."""
     return performer(n_frames, fps=fps, seed=seed).body.double()

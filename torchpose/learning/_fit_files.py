@@ -186,15 +186,17 @@ def _prior_lines(prior: UpperBodyPrior) -> list[str]:
             f"iterations{end}"
         )
     lines.append(f"noise    {', '.join(prior.noise) or 'not learnt'}")
-    return lines + [f"expect   {line}" for line in _expected(info.extra.get("held_out", {}))]
+    return lines + [f"expect   {line}" for line in _expected(info.extra)]
 
 
-def _expected(held_out: Mapping[str, Mapping[str, float]]) -> list[str]:
+def _expected(extra: Mapping[str, Any]) -> list[str]:
     """Return the expected errors of an unseen person, from those of the persons that were held out."""
+    held_out, still = extra.get("held_out", {}), extra.get("held_out_still", {})
     lines = []
-    for mode in ("causal", "full"):
-        errors = [100 * error for error in held_out.get(mode, {}).values()]
-        if errors:
-            spread = f" +- {stdev(errors):.1f}" if len(errors) > 1 else ""
-            lines.append(f"{fmean(errors):.1f}{spread} cm {MODES[mode]} on somebody new")
+    for mode in [mode for mode in ("causal", "full") if held_out.get(mode)] or held_out:
+        errors = [100 * error for error in held_out[mode].values()]
+        spread = f" +- {stdev(errors):.1f}" if len(errors) > 1 else ""
+        lines.append(f"{fmean(errors):.1f}{spread} cm {MODES[mode]} on somebody new")
+    if still:
+        lines.append(f"{100 * fmean(still.values()):.1f} cm of the mean pose, without looking")
     return lines

@@ -187,24 +187,30 @@ def _held_out(prior: UpperBodyPrior) -> str:
     if not held_out:
         known = not prior.info.persons or "fine_tuned" in prior.info.extra
         return "" if known else "Not known: no person was held out."
-    modes = sorted(held_out, key=list(MODES).index)
-    persons = sorted(held_out[modes[0]])
+    still = prior.info.extra.get("held_out_still", {})
+    columns = {"mean pose": still} if still else {}
+    columns |= {MODES[mode]: held_out[mode] for mode in sorted(held_out, key=list(MODES).index)}
+    persons = sorted(next(iter(held_out.values())))
     rows = [
-        [_cell(person), *(f"{100 * held_out[mode].get(person, math.nan):.1f}" for mode in modes)]
+        [_cell(person), *(f"{100 * own.get(person, math.nan):.1f}" for own in columns.values())]
         for person in persons
     ]
-    values = [[100 * value for value in held_out[mode].values()] for mode in modes]
+    values = [[100 * value for value in own.values()] for own in columns.values()]
     rows.append(["mean", *(f"{fmean(column):.1f}" for column in values)])
     if len(persons) > 1:
         rows.append(["standard deviation", *(f"{stdev(column):.1f}" for column in values)])
-    lines = ["| person | " + " | ".join(MODES[mode] for mode in modes) + " |"]
-    lines.append("|---|" + "---:|" * len(modes))
+    lines = ["| person | " + " | ".join(columns) + " |"]
+    lines.append("|---|" + "---:|" * len(columns))
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     return (
         "3D error in cm, after fixed-scale Procrustes on head, neck and shoulders, from head, neck "
         "and hands with 3 pixels of noise. Each person was tracked by the same recipe at half its "
         "size, fitted to others; somebody new can expect the mean, give or take the standard "
-        "deviation.\n\n" + "\n".join(lines)
+        "deviation."
+        + " The mean pose of that fit, which looks at nothing, is there to compare with."
+        * bool(still)
+        + "\n\n"
+        + "\n".join(lines)
     )
 
 

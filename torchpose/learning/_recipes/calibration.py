@@ -35,6 +35,9 @@ DRAWN = {
 }
 """The ways that draw samples; they take longer, and are tested on fewer frames."""
 
+STILL = "still"
+"""Key of the errors of the mean pose, beside those of the ways of tracking."""
+
 _VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
 _FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
 # Frames at the prior's rate; pieces at other rates last as long.
@@ -96,14 +99,7 @@ def track_held_out(
         drawn_pieces: pieces of recordings, of 60 frames at most, for the ways in `DRAWN`.
     """
     usual = float(prior.info.fps or DEFAULT_RATE)
-    recorded = zip(poses.joints.split(poses.lengths), poses.persons, poses.rates, strict=True)
-    pieces = [
-        _Piece(joints, person, rate)
-        for sequence, person, rate in recorded
-        if person in persons
-        for joints in sequence.split(_frames(_PIECE, rate, usual))
-    ]
-    pieces = pieces[:: max(1, len(pieces) // _SEQUENCES)]
+    pieces = _pieces(poses, persons, usual)
     if not pieces:
         return {}
     modes = {mode: s for mode, s in MODES.items() if mode == "pose" or mode in prior.windows}
@@ -118,12 +114,45 @@ def track_held_out(
     return found
 
 
+def still_poses(prior: UpperBodyPrior, poses: PoseSet, persons: set[str]) -> HeldOut | None:
+    """Return the errors of the prior's mean pose, which looks at nothing, in the frames that are tracked.
+
+    Args:
+        prior, poses, persons: see `track_held_out`.
+
+    Returns:
+        `HeldOut`, with covariances of zero; None if no frame has all joints.
+    """
+    pieces = _pieces(poses, persons, float(prior.info.fps or DEFAULT_RATE))
+    truth = torch.cat([piece.joints for piece in pieces] or [poses.joints[:0]]).double()
+    who = [piece.person for piece in pieces for _ in piece.joints]
+    whole = torch.isfinite(truth).flatten(1).all(1)
+    if not bool(whole.any()):
+        return None
+    truth = truth[whole]
+    aligned = align(prior.mean_pose().to(truth).expand_as(truth), truth)
+    covs = truth.new_zeros(*truth.shape, 3)
+    return HeldOut(aligned.points - truth, covs, [who[i] for i in whole.nonzero()[:, 0].tolist()])
+
+
 class _Piece(NamedTuple):
     """Holds joints [T, 8, 3] of a part of a recording, whose they are, and frames per second."""
 
     joints: Tensor
     person: str
     rate: float
+
+
+def _pieces(poses: PoseSet, persons: set[str], usual: float) -> list[_Piece]:
+    """Return parts of the recordings of some persons, evenly spread over them."""
+    recorded = zip(poses.joints.split(poses.lengths), poses.persons, poses.rates, strict=True)
+    pieces = [
+        _Piece(joints, person, rate)
+        for sequence, person, rate in recorded
+        if person in persons
+        for joints in sequence.split(_frames(_PIECE, rate, usual))
+    ]
+    return pieces[:: max(1, len(pieces) // _SEQUENCES)]
 
 
 def _frames(number: int, rate: float, usual: float) -> int:

@@ -21,9 +21,11 @@ from torchpose.errors import InputError, PriorError
 from torchpose.learning._recipes.calibration import (
     DRAWN,
     MODES,
+    STILL,
     HeldOut,
     calibration_noise,
     folds,
+    still_poses,
     track_held_out,
 )
 from torchpose.learning._recipes.settings import RecipeSettings
@@ -361,8 +363,8 @@ class UpperBodyRecipe:
             persons: ids (`Recording.person_id`) of those held out.
 
         Returns:
-            `HeldOut` by mode of tracking: errors and covariances of 3D joints, metres. None if the others
-            have no neck, since nothing can be fitted to them.
+            `HeldOut` by mode of tracking, and of the mean pose: errors and covariances of 3D joints, metres.
+            None if the others have no neck, since nothing can be fitted to them.
 
         Raises:
             InputError, PriorError: as `tasks`, of the recordings that are left.
@@ -374,7 +376,9 @@ class UpperBodyRecipe:
         neck = self.neck if self.neck in kinds else None
         partial = replace(self.smaller(), neck=neck).fit(seen)
         poses = replace(self, neck=partial.info.neck).poses(recordings)
-        return track_held_out(partial, poses, persons, self.seed, self.drawn_pieces)
+        found = track_held_out(partial, poses, persons, self.seed, self.drawn_pieces)
+        still = still_poses(partial, poses, persons)
+        return found if still is None else found | {STILL: still}
 
     def finish(self, prior: UpperBodyPrior, parts: Sequence[dict[str, HeldOut]]) -> UpperBodyPrior:
         """Calibrate a prior by the errors on held-out persons.
@@ -387,7 +391,8 @@ class UpperBodyRecipe:
             The prior.
         """
         found = HeldOut.join_modes(parts)
-        for key, value in calibration_noise(found).items():
+        tracked = {mode: part for mode, part in found.items() if mode != STILL}
+        for key, value in calibration_noise(tracked).items():
             prior.set_noise(key, value)
         errors = {
             mode: {person: round(error, 5) for person, error in part.error_by_person().items()}
@@ -401,6 +406,8 @@ class UpperBodyRecipe:
             own = {mode: value for mode, value in errors.items() if mode in among}
             if own:
                 extra[name] = before.get(name, {}) | own
+        if STILL in errors:
+            extra["held_out_still"] = errors[STILL]
         prior.info = replace(prior.info, extra=before | extra)
         return prior
 
