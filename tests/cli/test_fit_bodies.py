@@ -307,6 +307,17 @@ def test_lightning_is_not_imported(walks, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+def test_recordings_that_tell_no_action_are_counted(torchpose, walks, tmp_path):
+    for number, name in enumerate(("p0_0", "p0_1")):
+        with np.load(walks / f"{name}.npz") as archive:
+            arrays = {key: archive[key] for key in archive if number or key != "action"}
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+    done = torchpose(
+        "fit", "limbs", tmp_path, "--actions", "hop", "--out", tmp_path / "l.safetensors"
+    )
+    assert "no recording of hop; there are walk, and 1 recording without `action` in" in done.err
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.digests import digest_of
+from torchpose._core.wording import counted
 from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body, Frame
 from torchpose.body._skeleton import BODY_15, body_joints
@@ -79,7 +80,12 @@ def choose_recordings(
         done = sorted({r.action for r in recordings})
         missing = [action for action in actions if action not in done]
         if missing:
-            raise InputError(f"no recording of {', '.join(missing)}; there are {', '.join(done)}")
+            untold = sum(not r.action for r in recordings)
+            raise InputError(
+                f"no recording of {', '.join(missing)}; there are {', '.join(filter(None, done)) or 'none'}"
+                + f", and {counted(untold, 'recording')} without `action` in the .npz"
+                * bool(untold)
+            )
         recordings = [r for r in recordings if r.action in actions]
     found = ChosenRecordings(
         [r for r in recordings if r.person_id in wanted],
