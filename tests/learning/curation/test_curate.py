@@ -57,6 +57,7 @@ def test_poses_that_are_no_body():
     curated = curate([*people(), bad], CurationSettings(jump_speeds=None))
     [drop] = curated.report.drops
     assert (drop.reason, drop.frames, drop.joint) == ("no body", "190", "")
+    assert "dropped  1 frame: no body" in curated.report.text()
     assert curated.recordings[-1].joints[90].isnan().all()
 
 

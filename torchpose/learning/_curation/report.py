@@ -73,7 +73,7 @@ class CurationReport(NamedTuple):
     def text(self, most: int = 20) -> str:
         """Return a few lines for the command line: totals, then the largest drops."""
         lines = [f"read     {self.before.text()}", f"kept     {self.after.text()}"]
-        lines += [f"dropped  {n} {what}: {reason}" for reason, (n, what) in self.totals().items()]
+        lines += [f"dropped  {text}: {reason}" for reason, text in self._counted().items()]
         largest = sorted(self.drops, key=lambda drop: -drop.n_frames)[:most]
         lines += [f"         {drop.text()}" for drop in largest]
         if len(self.drops) > most:
@@ -90,13 +90,17 @@ class CurationReport(NamedTuple):
             counts[drop.reason, "joints" if drop.joint else "frames"] += drop.n_frames
         return {reason: (n, what) for (reason, what), n in sorted(counts.items())}
 
+    def _counted(self) -> dict[str, str]:
+        """Return `totals` in words."""
+        return {why: counted(n, what.removesuffix("s")) for why, (n, what) in self.totals().items()}
+
     def facts(self, most: int = 100) -> dict[str, Any]:
         """Return the report as plain values for JSON, with the largest drops."""
         largest = sorted(self.drops, key=lambda drop: -drop.n_frames)[:most]
         return {
             "before": self.before._asdict(),
             "after": self.after._asdict(),
-            "dropped": {reason: f"{n} {what}" for reason, (n, what) in self.totals().items()},
+            "dropped": self._counted(),
             "by_person": self._by_person(),
             "drops": [drop._asdict() for drop in largest],
             "drops_in_all": len(self.drops),
