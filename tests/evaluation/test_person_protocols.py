@@ -16,7 +16,7 @@ from benchmarks import uncommon_poses
 from tests.data import few_recordings
 from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
 from torchpose.cli import _evaluate as evaluate
-from torchpose.errors import InputError, OutputError, OverlapError
+from torchpose.errors import InputError, OutputError, OverlapError, PriorError
 from torchpose.evaluation import _cross_dataset as cross_dataset
 from torchpose.evaluation import _learning_curve as learning_curve
 from torchpose.evaluation import _leave_one_person_out as leave_one_person_out
@@ -174,6 +174,27 @@ def test_who_cannot_be_scored_is_told_before_any_fit(data, tmp_path):
 
     with pytest.raises(InputError, match="z: no 10 frames in a row have all eight joints"):
         leave_one_person_out.run(home, tmp_path / "out", progress=False, recipe=fit)
+
+
+@pytest.mark.parametrize("protocol", [leave_one_person_out, learning_curve])
+def test_hands_beside_wrists_are_refused_before_any_fit(protocol, data, tmp_path):
+    write_mocap(tmp_path / "mocap", ("carl",))
+    folders = [
+        data / "kinect_utd_mhad" / "s1_a01_t0.npz",
+        data / "burke_kinect",
+        tmp_path / "mocap",
+    ]
+    with pytest.raises(PriorError, match=r"what a hand is, got hand and wrist .*carl_a01_r0\.npz"):
+        protocol.run(folders, tmp_path / "out", progress=False)
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_a_data_set_of_one_person_is_refused(data, tmp_path):
+    one = write_people(tmp_path / "one", ("ann",), n_frames=FRAMES, first=9)
+    with pytest.raises(
+        InputError, match=r"one: .* to test \(ann\) and of others to train on, found ann"
+    ):
+        cross_dataset.run([one, data / "kinect_utd_mhad"], tmp_path / "out", progress=False)
 
 
 def test_names_may_have_digits_that_are_no_numbers(tmp_path):

@@ -313,8 +313,8 @@ def _split(persons: _Persons, tested: Sequence[str], name: str) -> _Split:
     train = {person: group for person, group in persons.items() if person not in tested}
     if not held or not train:
         raise InputError(
-            f"{name}: expected recordings of {', '.join(tested)} and of others, found "
-            f"{', '.join(persons)}"
+            f"{name}: expected recordings of persons to test ({', '.join(tested)}) and of others to train "
+            f"on, found {', '.join(persons)} alone; add a person"
         )
     return _Split(train, held)
 

@@ -44,6 +44,7 @@ from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, pooled, run_jobs
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import (
+    check_kinds,
     refuse_shared_between_persons,
     refuse_shared_recordings,
 )
@@ -98,7 +99,7 @@ def run(
     Raises:
         InputError: no such data, more training persons than there are, an unknown recipe, settings out
             of range. OverlapError: one recording under two persons, or in both halves of one.
-            OutputError: `out` cannot be written.
+            PriorError: hands beside wrists. OutputError: `out` cannot be written.
     """
     for setting, value in {"every": every, "workers": workers, "n_subsets": n_subsets}.items():
         check_count(setting, value)
@@ -228,7 +229,9 @@ def _read(
         persons = {name: group[::5] for name, group in persons.items()}
         counts = tuple(c for c in counts if c in counts[:2])
     others, more_notes = _further_persons(further, len(persons) - 1, max(counts), curated)
-    refuse_shared_between_persons([*recordings, *(r for group in others.values() for r in group)])
+    everything = [*recordings, *(r for group in others.values() for r in group)]
+    refuse_shared_between_persons(everything)
+    check_kinds(everything)
     return _Persons(persons, others, counts, [*notes, *more_notes])
 
 

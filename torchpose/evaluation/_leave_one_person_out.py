@@ -29,7 +29,7 @@ from torchpose.evaluation._person_tables import (
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, pooled, run_jobs
-from torchpose.learning._curation.splits import refuse_shared_between_persons
+from torchpose.learning._curation.splits import check_kinds, refuse_shared_between_persons
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 
@@ -69,7 +69,8 @@ def run(
 
     Raises:
         InputError: no such data, one person alone, or settings out of range. OverlapError: one
-            recording under two persons. OutputError: `out` cannot be written.
+            recording under two persons. PriorError: hands beside wrists. OutputError: `out` cannot be
+            written.
     """
     check_count("every", every)
     check_count("workers", workers)
@@ -82,6 +83,7 @@ def run(
             f"{', '.join(persons)}; add a folder with those of others"
         )
     refuse_shared_between_persons(recordings)
+    check_kinds(recordings)
     settings = fit_settings(
         "leave-one-person-out", seed, quick, n_components, window_components, window_samples,
         calibration_folds,
