@@ -9,6 +9,7 @@ from tests.priors.poses import lowered_neck, poses, recording
 from torchpose.errors import InputError
 from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.learning._recipes.earlier import renew_noise
+from torchpose.priors import UpperBodyPrior
 
 RECORDED = [recording(poses(200, seed=seed), person=f"p{seed}", fps=30.0) for seed in (1, 2)]
 WRISTS = tuple(name.replace("hand", "wrist") for name in RECORDED[0].names)
@@ -28,6 +29,20 @@ def test_the_same_recordings_make_the_same_noise(prior):
     assert renewed.noise.keys() == prior.noise.keys()
     for key, value in prior.noise.items():
         torch.testing.assert_close(renewed.noise[key], value, rtol=0, atol=0)
+
+
+def test_calibrations_of_the_noise_before_are_dropped(prior):
+    before = UpperBodyPrior(prior.left, prior.right, prior.info, dict(prior.noise))
+    for mode in ("pose", "pf_walk", "causal"):
+        before.set_noise(f"calibration_scale_{mode}", torch.ones(8))
+    errors = {"pose": {"p1": 0.1}, "causal": {"p1": 0.2}}
+    extra = before.info.extra | {"held_out": errors, "held_out_drawn": {"pf_walk": {"p1": 0.3}}}
+    before.info = replace(before.info, extra=extra)
+    renewed = renew_noise(before, RECORDED, calibration_folds=0)
+    assert [n for n in renewed.noise if n.startswith("calibration")] == ["calibration_scale_causal"]
+    assert renewed.info.extra["calibrated"] == ["calibration_scale_causal"]
+    assert renewed.info.extra["held_out"] == {"causal": {"p1": 0.2}}
+    assert "held_out_drawn" not in renewed.info.extra
 
 
 def test_a_frame_that_is_left_out_makes_no_others(prior):

@@ -1,8 +1,8 @@
 """Fit an earlier version of the upper-body recipe, and renew the noise of priors from earlier versions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 
@@ -10,6 +10,7 @@ from torchpose._core.frame_rates import same_rate
 from torchpose._core.wording import counted
 from torchpose.camera._viewpoints import ViewRange
 from torchpose.errors import InputError
+from torchpose.learning._recipes.calibration import DRAWN
 from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
 from torchpose.learning._samplers import SampleSource
@@ -18,6 +19,13 @@ from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
+
+_OVER_POSES = ("pose", *DRAWN)
+_OF_PROCESS_NOISE = (
+    "process_cov",
+    *(f"calibration_{what}_{mode}" for what in ("scale", "floor") for mode in _OVER_POSES),
+)
+"""Beginnings of the names of noise that is learnt anew, or no longer holds."""
 
 # nats: every second recording of the shipped prior's differs by 0.4, and bodies that are 5 % larger by 1.1
 _SAME_LIKELIHOOD = 0.1
@@ -57,7 +65,8 @@ def renew_noise(
     """Return a prior with the process noise, and the calibration over single poses, of this recipe.
 
     Mixtures and windows, with their calibration, stay as they are; persons are held out in turn as by
-    `UpperBodyRecipe.calibrate`, with the number of components, camera and seed of the prior.
+    `UpperBodyRecipe.calibrate`, with the number of components, camera and seed of the prior. Calibrations
+    over single poses that are not learnt anew are dropped: they are those of other noise.
 
     Args:
         prior: that the recipe fitted. recordings: those that it was fitted on.
@@ -71,14 +80,21 @@ def renew_noise(
     info = prior.info
     recipe = _recipe_of(prior, calibration_folds, drawn_pieces)
     _check_recordings(prior, recipe, recordings)
-    kept = {name: v for name, v in prior.noise.items() if not name.startswith("process_cov")}
+    kept = {name: v for name, v in prior.noise.items() if not name.startswith(_OF_PROCESS_NOISE)}
     noise = kept | recipe.process_noise(prior, recordings)
-    info = replace(
-        info, name=name or info.name, licence=licence or info.licence,
-        extra=info.extra | {"noise": {"recipe": VERSION, "command": command}},
-    )  # fmt: skip
+    extra = _without_results(info.extra) | {"noise": {"recipe": VERSION, "command": command}}
+    info = replace(info, name=name or info.name, licence=licence or info.licence, extra=extra)
     renewed = UpperBodyPrior(prior.left, prior.right, info, noise, prior.windows)
     return recipe.calibrate(renewed, recordings, progress)
+
+
+def _without_results(extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Return facts about a prior without errors of the filters that its process noise matters to."""
+    held_out = {mode: e for mode, e in extra.get("held_out", {}).items() if mode not in _OVER_POSES}
+    kept = {
+        name: fact for name, fact in extra.items() if name not in ("held_out", "held_out_drawn")
+    }
+    return kept | ({"held_out": held_out} if held_out else {})
 
 
 def _recipe_of(prior: UpperBodyPrior, calibration_folds: int, drawn_pieces: int) -> UpperBodyRecipe:
