@@ -317,6 +317,7 @@ def test_archives_under_other_keys_are_said(tmp_path):
     write(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", positions=pose(), joint_names=np.array(["head"]))
     np.savez(tmp_path / "keypoints.npz", keypoints=np.zeros(3))
+    np.savez(tmp_path / "scores-1.npz", filtered=np.zeros(3), smoothed=np.zeros(3))
     [note] = notes_on_unread_files(tmp_path, find_recordings(tmp_path))
     expected = (
         f"no arrays joints and names: {tmp_path / 'b.npz'}; the first has positions, joint_names"

@@ -65,6 +65,8 @@ def test_prior_is_that_of_torchpose_fit(fitted, recordings):
     assert "noise_calibration_scale_pose" in prior.state_dict()
     assert prior.info.persons == ("example/people#s1", "example/people#s2")
     assert prior.info.extra["held_out"].keys() == {"pose"}
+    still = wanted.info.extra["held_out_still"]
+    assert prior.info.extra["held_out_still"] == pytest.approx(still, abs=1e-5)
     fit, ours = wanted.info.extra["fit"], prior.info.extra["fit"]
     assert ours["iterations"] == fit["iterations"] == RECIPE["pose_steps"]
     assert ours["log_likelihood"] == pytest.approx(fit["log_likelihood"], abs=1e-8)

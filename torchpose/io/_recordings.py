@@ -67,12 +67,8 @@ DOUBTS = (LIES, MIRRORED, _BACK_TO_CAMERA)
 """How notes begin on recordings whose axes or sides are perhaps wrong."""
 _BESIDE_BODY = 0.3  # most distance of a centred body's origin from its joints, over their extent
 _SHOWN_JOINTS, _LISTED, _SHOWN_KEYS = 3, 2, 6  # joints, files and arrays that a note names
-_NO_RECORDINGS = (
-    "keypoints",
-    "joints2d",
-    "joints3d",
-    "state",
-)  # arrays of keypoints, and of results
+# arrays of keypoints, of results, and of what evaluations keep
+_NO_RECORDINGS = ("keypoints", "joints2d", "joints3d", "state", "filtered")
 _BACK = 2 * math.pi / 3  # radians of the mean heading, from which on the back is to the camera
 _FAR = 1e9  # in the unit of the file; no joint is there
 
