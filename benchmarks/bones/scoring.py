@@ -129,7 +129,7 @@ def trackers(arms: ArmPrior, lifter: ArmLifter | None = None) -> dict[str, dict[
         arms: prior over arms. lifter: network that lifts arms; None is that of the package.
     """
     options: dict[str, dict[str, object]] = {
-        "articulated": {"arms": arms},
+        "articulated": {"arms": arms, "lifter": lifter},
         "multiple-model": {"arms": arms, "lifter": lifter},
     }
     return {name: {"method": name, **options.get(name, {})} for name in METHODS}

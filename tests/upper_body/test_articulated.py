@@ -10,6 +10,7 @@ import torch
 
 import torchpose
 from tests.data import data_dir_or_skip
+from tests.upper_body.lifters import UNSURE
 from tests.upper_body.seen import see_torso
 from torchpose.errors import InputError
 from torchpose.io import read_recordings
@@ -88,7 +89,7 @@ def test_a_waving_body_is_followed_in_space():
 
 
 def test_bones_keep_their_lengths():
-    found = tracker()(pixels(body(110), 3.0)[None]).joints3d[0, 50:]
+    found = tracker(lifter=UNSURE)(pixels(body(110), 3.0)[None]).joints3d[0, 50:]
     for side in ("left", "right"):
         for bone in bones(found, side):
             length = torch.linalg.vector_norm(bone, dim=-1)
@@ -164,7 +165,8 @@ def test_scale_and_depth_are_one():
     """A body twice as large at twice the distance has the same pixels, so the scale stays the prior's."""
     torch.testing.assert_close(pixels(2 * body(12)), pixels(body(12)))
     near, far = (
-        tracker()(pixels(j)[None]).joints3d[0, -1] for j in (body(12), body(12, depth=4.4))
+        tracker(lifter=UNSURE)(pixels(j)[None]).joints3d[0, -1]
+        for j in (body(12), body(12, depth=4.4))
     )
     assert float(far[ROW["neck"], 2] / near[ROW["neck"], 2]) > 1.5
     upper = torch.linalg.vector_norm(bones(far, "left")[0])
@@ -424,7 +426,8 @@ def test_covariances_of_arms_hold_the_whole_spread_of_sizes_over_persons(calibra
     arms, uv = shipped_arm_prior(), pixels(body(1), 2.0)[None]
     spread = (arms.spread.square() + 0.05**2).sqrt()
     varied = ArmPrior(arms.directions, arms.lengths, spread, arms.broad, arms.info, arms.together)
-    usual, wide = (tracker(arms=own, calibrated=calibrated)(uv) for own in (arms, varied))
+    options = {"lifter": UNSURE, "calibrated": calibrated}
+    usual, wide = (tracker(arms=own, **options)(uv) for own in (arms, varied))
     torch.testing.assert_close(wide.joints3d, usual.joints3d)
     apart = usual.joints3d - usual.joints3d[:, :, [ROW["neck"]]]
     outer = apart[..., :, None] * apart[..., None, :]
@@ -666,9 +669,9 @@ def test_a_middle_of_the_shoulders_alone_is_seen_where_it_is():
 
 def test_limbs_that_nobody_sees_are_expected_nearer_than_their_lengths():
     keypoints = pixels(body(30), 2.0)[None]
-    whole = tracker()(keypoints, names=list(UPPER_BODY))
+    whole = tracker(lifter=UNSURE)(keypoints, names=list(UPPER_BODY))
     keypoints[:, 20:, ROW["elbow_left"]] = torch.nan
-    track = tracker()(keypoints, names=list(UPPER_BODY))
+    track = tracker(lifter=UNSURE)(keypoints, names=list(UPPER_BODY))
     lengths = [
         torch.linalg.vector_norm(bones(x.joints3d[0], "left")[0], dim=-1) for x in (whole, track)
     ]

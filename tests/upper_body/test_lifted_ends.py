@@ -56,9 +56,12 @@ def ends_of(joints):
     return joints[..., list(LIMBS), :].unflatten(-2, (2, 2)) - joints[..., SHOULDERS, None, :]
 
 
-def averaged(ends, std=STD, known=WHOLE, given=None, trust=(1.0, 1.0)):
+MODESTY = 0.25
+
+
+def averaged(ends, std=STD, known=WHOLE, given=None, trust=(1.0, 1.0), unit=1.0):
     given = poses() if given is None else given
-    model = EndsAverage(Told(ends, std), MATRIX, 30.0, wrists=False, trust=trust)
+    model = EndsAverage(Told(ends, std), MATRIX, 30.0, False, trust, MODESTY, unit)
     known = known.expand(*given.joints.shape[:2], 8)
     state = model.init(len(known))
     lifted = model.lift(state, given, known)
@@ -116,6 +119,11 @@ def test_a_network_that_knows_longer_arms_moves_the_body_farther_away():
     torch.testing.assert_close(found.uv, poses().uv)
     middle = UPPER_BODY.index("neck")
     torch.testing.assert_close(found.joints[:, :, middle, 2], found.place[..., 2])
+
+
+def test_a_network_knows_persons_of_the_size_that_they_are_known_to_have():
+    found = averaged(own_ends() / 0.6, STD, unit=0.6)
+    torch.testing.assert_close(found.joints, poses().joints)
 
 
 def test_a_network_that_is_wrong_and_sure_does_not_move_the_body_behind_the_camera():

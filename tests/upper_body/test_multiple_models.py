@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from tests.upper_body.lifters import UNSURE, Told
 from tests.upper_body.test_articulated import CAMERA, ROW, body, pixels
 from torchpose import PinholeCamera
-from torchpose.camera._virtual_camera import axes_along
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
 from torchpose.filters._outputs import FilterOutput
 from torchpose.math import euler_to_matrix
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors._arm_lifter import ArmLifter, LiftedArms, shipped_arm_lifter
+from torchpose.priors._arm_lifter import shipped_arm_lifter
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker, _multiple_models
-from torchpose.upper_body._articulated_frame import LIMBS
 from torchpose.upper_body._estimator import Estimates, SeenPoses
 from torchpose.upper_body._fusion import ReadOut, in_body_axes, in_camera_axes, put_at
 from torchpose.upper_body._lifted_ends import Ends
@@ -28,10 +27,7 @@ from torchpose.upper_body._multiple_models import _averaged, _clues, _log_odds
 
 BOTH = ("window-mixture", "articulated")
 FEW = ("head", "neck", "hand_left", "hand_right")
-UNSURE = ArmLifter().requires_grad_(False)
-"""A network that is not sure of anything, so that nothing is averaged with it."""
-torch.nn.init.constant_(UNSURE.spread.bias, 20.0)
-WITHOUT_LIFTED = {"multiple-model": {"lifter": UNSURE}}
+WITHOUT_LIFTED = {name: {"lifter": UNSURE} for name in ("multiple-model", "articulated")}
 INFERRED = [
     UPPER_BODY.index(f"{kind}_{side}")
     for kind in ("shoulder", "elbow")
@@ -42,20 +38,6 @@ INFERRED = [
 @pytest.fixture(scope="module")
 def of_performer():
     return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
-
-
-class Told(ArmLifter):
-    """A network that is sure of the elbows and hands of these joints [T, 8, 3], frame by frame."""
-
-    def __init__(self, joints):
-        super().__init__()
-        arms = joints[:, list(LIMBS)].unflatten(1, (2, 2))
-        ends = arms - joints[:, [ROW["shoulder_left"], ROW["shoulder_right"]], None]
-        self.told = (ends.flatten(1, 2) @ axes_along(joints[:, ROW["neck"]])).view_as(ends)
-
-    def forward(self, seen):
-        ends = self.told.expand(*seen.shape[:-2], *self.told.shape)
-        return LiftedArms(ends, torch.full_like(ends[..., 0], 0.05))
 
 
 def of_stranger(n_frames=40):
@@ -244,7 +226,7 @@ def test_frames_without_arms_leave_the_odds_and_how_far_both_models_are_apart(pr
     keypoints[:, 10:, 2:] = torch.nan
     mixed, bones = (
         of(prior, keypoints, smoothing=smoothing, steady=False).joints3d[0]
-        for of in (averaged, functools.partial(tracked, method="articulated"))
+        for of in (averaged, functools.partial(tracked, method="articulated", lifter=UNSURE))
     )
     apart = (mixed - bones)[:, INFERRED]
     torch.testing.assert_close(apart[10:], apart[9].expand(20, 4, 3), atol=1e-6, rtol=1e-6)
@@ -345,10 +327,13 @@ def test_covariances_are_narrower_where_both_models_have_weight(prior):
 def test_windows_that_a_network_has_elsewhere_count_less(prior):
     """A network that is sure of the arms of bones."""
     keypoints = of_stranger(30)
-    seen = tracked(prior, keypoints, "articulated").joints3d[0]
+    seen = tracked(prior, keypoints, "articulated", lifter=UNSURE).joints3d[0]
     apart = {}
     for name in (None, *BOTH):
-        lifter = UNSURE if name is None else Told(tracked(prior, keypoints, name).joints3d[0])
+        own = WITHOUT_LIFTED.get(name, {})
+        lifter = (
+            UNSURE if name is None else Told(tracked(prior, keypoints, name, **own).joints3d[0])
+        )
         mixed = tracked(prior, keypoints, "multiple-model", lifter=lifter).joints3d[0]
         apart[name] = float((mixed - seen)[20:, INFERRED].norm(dim=-1).mean())
     assert apart["articulated"] < 0.8 * apart[None] < 0.9 * apart["window-mixture"]

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.upper_body.lifters import UNSURE
 from torchpose.demo import demo_camera, performer
 from torchpose.metrics import coverage
 from torchpose.skeleton import UPPER_BODY
@@ -83,7 +84,7 @@ def test_ellipsoids_of_noisy_keypoints_hold_more(prior, joints):
     neck = UPPER_BODY.index("neck")
     inside = []
     for outliers in (True, False):
-        track = tracked(prior, joints, 10.0, outliers=outliers)
+        track = tracked(prior, joints, 10.0, outliers=outliers, lifter=UNSURE)
         found, true = (x - x[:, [neck]] for x in (track.joints3d[0], joints))
         inside.append(float(coverage(found, track.covariance3d[0], true).overall[1]))
     adapted, plain = inside

@@ -178,6 +178,17 @@ class Estimates(NamedTuple):
     poses: SeenPoses | None = None
     bones: Bones | None = None
 
+    @property
+    def seen_poses(self) -> SeenPoses:
+        """Return the poses.
+
+        Raises:
+            RuntimeError: the estimator estimates the states of single arms.
+        """
+        if self.poses is None:
+            raise RuntimeError("the estimator reads out no poses itself")
+        return self.poses
+
 
 class MotionRatios(NamedTuple):
     """Ratios q/r, 1/s^3, of the constant-velocity filters over joints, their pixels and the placement."""

@@ -17,8 +17,8 @@ from torchpose.filters._sampled_tracks import SampledTrackFilter
 from torchpose.filters._split_tracks import SplitTrackFilter
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._estimator import Estimator
+from torchpose.upper_body._lifted_articulated import LiftedArticulatedFilter
 from torchpose.upper_body._multiple_models import MultipleModelFilter
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
 from torchpose.upper_body._window_view import suitable_window
@@ -31,7 +31,7 @@ SINGLE_POSES = "mkf-fixed"
 """The bank of Kalman filters over single poses."""
 
 BONES = "articulated"
-"""Arms of bones that keep their lengths."""
+"""Arms of bones that keep their lengths, averaged with lifted ones."""
 
 _BOTH = "multiple-model"
 
@@ -54,7 +54,7 @@ def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
 
 METHODS: dict[str, Method] = {
     WINDOWS: WindowMixture,
-    BONES: ArticulatedFilter,
+    BONES: LiftedArticulatedFilter,
     _BOTH: MultipleModelFilter,
     SINGLE_POSES: _kalman_bank(FixedTrackFilter, 100.0, ("transition", "gamma", "uniform_weight")),
     "mkf-sampled": _kalman_bank(SampledTrackFilter, 10.0, ("transition", "gamma")),

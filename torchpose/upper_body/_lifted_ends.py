@@ -6,16 +6,19 @@ how arms of many persons look from there. They err differently.
 
 from __future__ import annotations
 
+import copy
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.module_state import index_tensor
+from torchpose._core.module_state import derived, index_tensor, outside_inference
 from torchpose._core.rows import discounted_sums, in_frames, joined, last_known
 from torchpose.camera._projection import pixel_rays
+from torchpose.errors import InputError
 from torchpose.priors._arm_lifter import (
     JOINTS,
     ArmLifter,
@@ -23,10 +26,11 @@ from torchpose.priors._arm_lifter import (
     arm_features,
     farthest_so_far,
     from_neck,
+    shipped_arm_lifter,
 )
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, LIMBS, SHOULDERS
-from torchpose.upper_body._estimator import SeenPoses
+from torchpose.upper_body._estimator import SeenPoses, TrackerModel
 from torchpose.upper_body._fusion import NEAREST
 
 _ARM = ("shoulder", "elbow", "hand")
@@ -34,10 +38,9 @@ _ARMS = tuple(UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right") 
 _ROWS = tuple(UPPER_BODY.index(name) for name in JOINTS)
 _NECK, _HEAD = UPPER_BODY.index("neck"), JOINTS.index("head")
 _SHOULDERS = slice(0, len(JOINTS) - 1, len(_ARM))  # of `JOINTS`
-_MEMORY = 0.3  # seconds over which a body keeps its factor
+_MEMORY = 2.0  # seconds over which a body keeps its factor
 _MOST = 1.25  # of that factor, or 1 over it
 _AT_ONCE = 4096  # frames whose hidden layers are kept together
-_MODESTY = 0.25  # factor on the variances of poses, to find their share: they are rather too wide
 _STEADY = 0.05  # square metres of arms in the image that speak for a factor of 1 at the beginning
 
 
@@ -79,21 +82,22 @@ class EndsAverage:
     of variance v, are averaged as of sources whose errors may be alike in an unknown way (covariance
     intersection with equal shares, Julier and Uhlmann 1997):
 
-        c = (v a + 0.25 u b) / (0.25 u + v),   C = 2 v / (0.25 u + v) A
+        c = (v a + m u b) / (m u + v),   C = 2 v / (m u + v) A
 
-    with the covariances A and C before and after. The network may know a larger or smaller body. So the
-    body is moved along its rays by the factor that explains c best,
+    with the covariances A and C before and after; m < 1 is for A that are too wide. The network may know a
+    larger or smaller body. So the body is moved along its rays by the factor that explains c best,
 
         k = sum a c / sum a a
 
-    over x and y of both arms and the last 0.3 s, from 0.8 to 1.25. Measured joints stay on their rays, and
+    over x and y of both arms and the last 2 s, from 0.8 to 1.25. Measured joints stay on their rays, and
     shoulders that are not measured go where c then has them. An arm of which the hand is not measured, or
     nothing that tells the size of the body, is moved as when it last was.
 
     Args:
         network: that lifts. matrix: K of the prior's camera. fps: frames per second.
         wrists: whether hands are measured at the wrist. trust: factors on the covariances C of arms of which
-            the elbow is measured, and of the others.
+            the elbow is measured, and of the others; None leaves covariances as they are. modesty: m.
+        unit: how many times as large the person is known to be as those of the network.
     """
 
     def __init__(
@@ -102,15 +106,18 @@ class EndsAverage:
         matrix: Float[Tensor, "3 3"],
         fps: float,
         wrists: bool,
-        trust: tuple[float, float] = (1.0, 1.0),
+        trust: tuple[float, float] | None = None,
+        modesty: float = 1.0,
+        unit: float = 1.0,
     ) -> None:
         self.network, self.matrix, self.fps, self.wrists = network, matrix, fps, wrists
-        self.trust, self.forget = trust, math.exp(-1 / (_MEMORY * fps))
+        self.trust, self.modesty, self.unit = trust, modesty, unit
+        self.forget = math.exp(-1 / (_MEMORY * fps))
 
     def init(self, batch_size: int) -> LiftedState:
         """Return the state before the first frame."""
         zeros = self.matrix.new_zeros
-        sums = self.matrix.new_full((batch_size, 2), _STEADY)
+        sums = self.matrix.new_full((batch_size, 2), _STEADY * self.unit**2)
         return LiftedState(zeros(batch_size, len(JOINTS)), sums, zeros(batch_size, 2, 3, 3))
 
     def lift(self, state: LiftedState, poses: SeenPoses, known: Bool[Tensor, "B T 8"]) -> Ends:
@@ -129,9 +136,9 @@ class EndsAverage:
         ends = (found.ends.flatten(2, 3) @ axes.mT).unflatten(2, (2, 2))
         metres = poses.joints.index_select(2, limbs)[..., 2] / self.matrix[0, 0]
         pixels = _along_an_axis(poses.uv_covs.index_select(2, limbs)) * metres.square()
-        variance = found.std.square() + pixels.unflatten(2, (2, 2))
+        variance = (self.unit * found.std).square() + pixels.unflatten(2, (2, 2))
         sized = given[..., _HEAD] | given[..., _SHOULDERS].all(-1)
-        return Ends(ends, variance, known[:, :, HANDS] & sized[..., None], farthest)
+        return Ends(self.unit * ends, variance, known[:, :, HANDS] & sized[..., None], farthest)
 
     def advance(
         self, state: LiftedState, poses: SeenPoses, lifted: Ends, known: Bool[Tensor, "B T 8"]
@@ -154,9 +161,10 @@ class EndsAverage:
         aside = _placed(arms, both, seen) - arms
         aside = in_frames(last_known(lifted.told), state.aside, aside)
         joints = (factor[..., None] * poses.joints).index_add(2, rows, aside.flatten(2, 3))
-        trust = torch.where(seen[..., 1:2], *self.trust)
-        factors = torch.where(lifted.told[..., None], 2 * trust * (1 - share), 1.0)
-        covs = _scaled(poses.covs, factors)
+        covs = poses.covs
+        if self.trust is not None:
+            factors = 2 * torch.where(seen[..., 1:2], *self.trust) * (1 - share)
+            covs = _scaled(covs, torch.where(lifted.told[..., None], factors, 1.0))
         now, before = _pixels(torch.stack([joints, poses.joints]), self.matrix)
         uv = poses.uv + now - before  # which are not where the mean joints project to
         averaged = poses._replace(joints=joints, covs=covs, uv=uv, place=factor * poses.place)
@@ -173,7 +181,7 @@ class EndsAverage:
     def _share(self, poses: SeenPoses, lifted: Ends) -> Float[Tensor, "B T 2 2"]:
         """Return the share of the network at each elbow and hand."""
         covs = poses.covs.index_select(2, index_tensor(LIMBS, poses.covs.device))
-        ours = _MODESTY * _along_an_axis(covs).unflatten(2, (2, 2))
+        ours = self.modesty * _along_an_axis(covs).unflatten(2, (2, 2))
         return ours / (ours + lifted.variance)
 
     def _sums(
@@ -188,6 +196,52 @@ class EndsAverage:
         products = torch.stack([both[..., :2], ends[..., :2]], 2) * level[:, :, None]
         keep = torch.where(told.any(-1), self.forget, 1.0)[..., None]
         return discounted_sums(before, products.flatten(3).sum(-1), keep)
+
+
+def ends_average(
+    model: TrackerModel,
+    lifter: ArmLifter | str | Path | None,
+    modesty: float,
+    trust: tuple[float, float] | None = None,
+    unit: float = 1.0,
+) -> EndsAverage:
+    """Return the average with lifted arms for a tracker.
+
+    Args:
+        model: the model of the tracker; covariances that are not to be calibrated stay.
+        lifter: the network that lifts arms, or its file; None is that of the package.
+        modesty, trust, unit: as in `EndsAverage`.
+
+    Raises:
+        InputError: no network, or no such file. FileFormatError: a file of another kind.
+    """
+    matrix = model.prior.info.matrix_like(model.measurement_cov)
+    network = _network_of(model, lifter, matrix)
+    wrists = (model.hand or model.prior.info.hand) == "wrist"
+    trusted = trust if model.calibrated else None
+    return EndsAverage(network, matrix, model.rate, wrists, trusted, modesty, unit)
+
+
+def _network_of(
+    model: TrackerModel, lifter: ArmLifter | str | Path | None, like: Tensor
+) -> ArmLifter:
+    """Return the network that lifts arms, which the tracker keeps, as a tensor has device and precision."""
+    if not isinstance(lifter, ArmLifter | str | Path | None):
+        raise InputError(
+            f"lifter must be a network that lifts arms or the path of its file, got {type(lifter).__name__}"
+        )
+    given = tuple(lifter.parameters()) if isinstance(lifter, ArmLifter) else ()
+    file = "" if isinstance(lifter, ArmLifter) else str(lifter or "")
+
+    def made() -> ArmLifter:
+        if isinstance(lifter, ArmLifter):
+            network = lifter
+        else:
+            network = ArmLifter.load(file) if file else shipped_arm_lifter()
+        with outside_inference():
+            return copy.deepcopy(network).to(like).eval().requires_grad_(False)
+
+    return derived(model.owner, ("arm lifter", file), (like, *given), made)
 
 
 def farther_off(

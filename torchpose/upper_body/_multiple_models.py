@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.rows import discounted_sums, in_frames, last_known
-from torchpose.errors import InputError
 from torchpose.filters._lengths import inside_lengths
 from torchpose.filters._outputs import first_not_finite
-from torchpose.priors._arm_lifter import ArmLifter, shipped_arm_lifter
+from torchpose.priors._arm_lifter import ArmLifter
 from torchpose.priors._arms import ArmPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
@@ -40,7 +37,7 @@ from torchpose.upper_body._fusion import (
     recalibrated,
     stage_lag,
 )
-from torchpose.upper_body._lifted_ends import Ends, EndsAverage, LiftedState, farther_off
+from torchpose.upper_body._lifted_ends import Ends, LiftedState, ends_average, farther_off
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._window_view import suitable_window
 from torchpose.upper_body._windows import WindowMixture, WindowState
@@ -62,6 +59,7 @@ _BETWEEN = 0.5
 # Factors on the covariances of arms that are averaged with lifted ones, of which the elbow is measured, and
 # of the others.
 _TRUST = 0.5, 0.6
+_MODESTY = 0.25  # factor on the variances of this average, to find its share beside lifted arms
 
 
 class MultipleModelState(NamedTuple):
@@ -141,10 +139,7 @@ class MultipleModelFilter(Estimator):
         self.forget = math.exp(-1 / (_MEMORY * model.rate))
         self.matrix = model.prior.info.matrix_like(model.measurement_cov)
         self.order = model.prior.info.rotation_order
-        wrists = (model.hand or model.prior.info.hand) == "wrist"
-        network = _network_of(model.owner, lifter, self.matrix)
-        trust = _TRUST if model.calibrated else (1.0, 1.0)
-        self.ends = EndsAverage(network, self.matrix, model.rate, wrists, trust)
+        self.ends = ends_average(model, lifter, _MODESTY, _TRUST)
         self._usual = _USUAL_TIME * model.rate * self.matrix.new_tensor(_USUAL)
 
     def init(
@@ -171,7 +166,7 @@ class MultipleModelFilter(Estimator):
             motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
         poses = in_camera_axes(reading, self.order)
         poses, apart = _held(poses, bodies, measured, state.apart)
-        ends = self.ends.lift(state.lifted, _poses_of(bodies), measured.mask)
+        ends = self.ends.lift(state.lifted, bodies.seen_poses, measured.mask)
         sums = discounted_sums(
             state.clues, _clues(seen, bodies, poses, ends, measured), self.forget
         )
@@ -209,7 +204,7 @@ class MultipleModelFilter(Estimator):
                 measured, joints, arm_generators, lengths, progress
             )
         begun = self.ends.init(len(poses.joints))
-        ends = self.ends.lift(begun, _poses_of(bodies), measured.mask)
+        ends = self.ends.lift(begun, bodies.seen_poses, measured.mask)
         clues = _clues(told, predicted, poses, ends, measured)
         if lengths is not None:
             inside = inside_lengths(lengths.to(clues.device), clues.shape[1])
@@ -274,7 +269,7 @@ class MultipleModelFilter(Estimator):
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             poses = poses._replace(covs=recalibrated(poses.covs, noise, mode))
         share = torch.sigmoid(_log_odds(sums))
-        mixed = _averaged(share, poses, _poses_of(bodies))
+        mixed = _averaged(share, poses, bodies.seen_poses)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
             mixed = mixed._replace(covs=trust[..., None, None, None] * mixed.covs)
@@ -312,7 +307,7 @@ def _held(
     Returns:
         The poses, and how far apart both are after the last frame.
     """
-    told, theirs = _some_arm(measured.mask), _packed(_poses_of(bodies))
+    told, theirs = _some_arm(measured.mask), _packed(bodies.seen_poses)
     ours = _packed(poses)
     if bool(told.all()):
         return poses, ours[:, -1] - theirs[:, -1]
@@ -328,13 +323,6 @@ def _held(
 def _packed(poses: SeenPoses) -> Float[Tensor, "B T 43"]:
     """Return joints, pixels and places of poses in one tensor."""
     return torch.cat([poses.joints.flatten(2), poses.uv.flatten(2), poses.place], -1)
-
-
-def _poses_of(bodies: Estimates) -> SeenPoses:
-    """Return the poses that the filter of bones reads out itself."""
-    if bodies.poses is None:
-        raise RuntimeError("an articulated filter reads its poses itself")
-    return bodies.poses
 
 
 def _some_arm(mask: Bool[Tensor, "B T 8"]) -> Bool[Tensor, "B T"]:
@@ -356,7 +344,7 @@ def _clues(
             lifted. measured: what both measured.
     """
     ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (windows, bodies))
-    both = torch.stack([poses.joints, _poses_of(bodies).joints])
+    both = torch.stack([poses.joints, bodies.seen_poses.joints])
     shoulders, elbows, hands = (both[..., rows, :] for rows in (SHOULDERS, ELBOWS, HANDS))
     lengths = (elbows - shoulders).norm(dim=-1) + (hands - elbows).norm(dim=-1)
     logs = torch.cat([both[..., _NECK, 2:], lengths], -1).log()
@@ -401,33 +389,3 @@ def _moments(
     pulled = weight * apart
     spread = pulled[..., :, None] * (apart - pulled)[..., None, :]
     return theirs[0] + pulled, theirs[1].lerp(ours[1], weight[..., None]) + spread
-
-
-def _network_of(owner: nn.Module, lifter: ArmLifter | str | Path | None, like: Tensor) -> ArmLifter:
-    """Return the network that lifts arms, on the device and in the precision of a tensor.
-
-    Args:
-        owner: the module with which it is kept. lifter: a network or its file; None is that of the package.
-        like: the tensor.
-
-    Raises:
-        InputError: something else, or no such file. FileFormatError: a file of another kind.
-    """
-    if not isinstance(lifter, ArmLifter | str | Path | None):
-        raise InputError(
-            f"lifter must be a network that lifts arms or the path of its file, got {type(lifter).__name__}"
-        )
-
-    given: tuple[Tensor, ...] = ()
-    file = str(lifter or "")
-    if isinstance(lifter, ArmLifter):
-        given, file = tuple(lifter.parameters()), ""
-
-    def made() -> ArmLifter:
-        network = lifter if isinstance(lifter, ArmLifter) else None
-        if network is None:
-            network = ArmLifter.load(file) if file else shipped_arm_lifter()
-        with outside_inference():
-            return copy.deepcopy(network).to(like).eval().requires_grad_(False)
-
-    return derived(owner, ("arm lifter", file), (like, *given), made)
