@@ -140,14 +140,17 @@ def test_many_frames_are_lifted_in_parts(monkeypatch):
     torch.testing.assert_close(parts.covs, whole.covs, atol=0, rtol=0)
 
 
-def test_shoulders_that_are_not_measured_go_where_arms_have_them():
+def test_shoulders_go_where_arms_have_them_unless_they_or_elbows_are_measured():
     theirs = own_ends() + torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)
-    few, whole = (averaged(theirs, STD, known) for known in (FEW, WHOLE))
+    bent = FEW | torch.zeros_like(FEW).index_fill(0, torch.tensor(ELBOWS), True)
+    few, whole, elbows = (averaged(theirs, STD, known) for known in (FEW, WHOLE, bent))
     share = 1 / 5
     for side in BOTH_SHOULDERS:
         lifted = poses().joints[..., side, 1] - few.joints[..., side, 1]
         assert bool((lifted > 0.8 * share * 0.1).all())
-    torch.testing.assert_close(whole.uv[..., BOTH_SHOULDERS, :], poses().uv[..., BOTH_SHOULDERS, :])
+    for found in (whole, elbows):
+        seen = found.uv[..., BOTH_SHOULDERS, :]
+        torch.testing.assert_close(seen, poses().uv[..., BOTH_SHOULDERS, :])
 
 
 def test_an_arm_without_a_hand_is_moved_as_when_it_last_had_one():

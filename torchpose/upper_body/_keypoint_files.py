@@ -51,8 +51,8 @@ class TrackSettings:
         n_particles: the number of particles of the pf methods (default 10000).
         n_tracks: the number of tracks of mkf-sampled and mkf-split.
         arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
-        lifter: multiple-model: the file of a network that lifts arms; by default the one that comes with
-            torchpose.
+        lifter: articulated, multiple-model: the file of a network that lifts arms; by default the one that
+            comes with torchpose.
         bone_lengths: articulated: lengths measured on the person in metres, with commas: any of
             upper_arm=, forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above
             Kinect's neck, which is 10.5 cm above the middle of the shoulders).

@@ -90,7 +90,7 @@ class EndsAverage:
         k = sum a c / sum a a
 
     over x and y of both arms and the last 2 s, from 0.8 to 1.25. Measured joints stay on their rays, and
-    shoulders that are not measured go where c then has them. An arm of which the hand is not measured, or
+    shoulders of arms of which the hand alone is measured go where c then has them. An arm of which the hand is not measured, or
     nothing that tells the size of the body, is moved as when it last was.
 
     Args:
@@ -275,6 +275,8 @@ def _placed(
 ) -> Float[Tensor, "B T 2 3 3"]:
     """Return shoulders, elbows and hands such that those that are measured stay on their rays.
 
+    Shoulders stay where they or their elbows are measured.
+
     Args:
         arms: where they are expected. ends: elbows and hands from their shoulders. known: which joints
             are measured.
@@ -283,7 +285,7 @@ def _placed(
     shoulder, elbow, hand = known[..., None].unbind(-2)
     wanted = shoulders + ends[..., 1, :]
     hands = torch.where(hand, _nearest_on(hands, wanted), wanted)
-    shoulders = torch.where(shoulder, shoulders, shoulders + hands - wanted)
+    shoulders = torch.where(shoulder | elbow, shoulders, shoulders + hands - wanted)
     wanted = shoulders + ends[..., 0, :]
     elbows = torch.where(elbow, _nearest_on(elbows, wanted), wanted)
     return torch.stack([shoulders, elbows, hands], -2)
