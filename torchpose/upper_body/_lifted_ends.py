@@ -90,8 +90,8 @@ class EndsAverage:
         k = sum a c / sum a a
 
     over x and y of both arms and the last 2 s, from 0.8 to 1.25. Measured joints stay on their rays, and
-    shoulders of arms of which the hand alone is measured go where c then has them. An arm of which the hand is not measured, or
-    nothing that tells the size of the body, is moved as when it last was.
+    shoulders of arms of which the hand alone is measured go where c then has them. An arm of which the hand
+    is not measured, or nothing that tells the size of the body, is moved as when it last was.
 
     Args:
         network: that lifts. matrix: K of the prior's camera. fps: frames per second.
