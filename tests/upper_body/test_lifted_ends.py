@@ -1,5 +1,7 @@
 """Poses are averaged with what a network lifts, joint by joint as each is sure."""
 
+import math
+
 import pytest
 import torch
 
@@ -59,9 +61,9 @@ def ends_of(joints):
 MODESTY = 0.25
 
 
-def averaged(ends, std=STD, known=WHOLE, given=None, trust=(1.0, 1.0), unit=1.0):
+def averaged(ends, std=STD, known=WHOLE, given=None, trust=(1.0, 1.0), unit=1.0, level=False):
     given = poses() if given is None else given
-    model = EndsAverage(Told(ends, std), MATRIX, 30.0, False, trust, MODESTY, unit)
+    model = EndsAverage(Told(ends, std), MATRIX, 30.0, False, trust, MODESTY, unit, level)
     known = known.expand(*given.joints.shape[:2], 8)
     state = model.init(len(known))
     lifted = model.lift(state, given, known)
@@ -124,6 +126,20 @@ def test_a_network_that_knows_longer_arms_moves_the_body_farther_away():
 def test_a_network_knows_persons_of_the_size_that_they_are_known_to_have():
     found = averaged(own_ends() / 0.6, STD, unit=0.6)
     torch.testing.assert_close(found.joints, poses().joints)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.35, -0.35])
+def test_arms_of_bodies_that_are_seen_from_above_hang_along_gravity(angle):
+    """The network has them hang in axes that look at the neck, whatever its angle below the horizon is."""
+    hanging = torch.zeros_like(own_ends())
+    hanging[..., 1] = math.cos(angle) * torch.tensor([0.27, 0.52], dtype=torch.float64)
+    given = poses()
+    lower = torch.tensor([0.0, 2.0 * math.tan(angle), 0.0], dtype=torch.float64)
+    joints = given.joints + lower
+    seen = joints @ MATRIX.mT
+    given = given._replace(joints=joints, uv=seen[..., :2] / seen[..., 2:], place=joints[:, :, 2])
+    depth = ends_of(averaged(hanging, 1e-4, FEW, given, level=True).joints)[..., 2]
+    torch.testing.assert_close(depth, torch.zeros_like(depth), atol=0.02, rtol=0)
 
 
 def test_a_network_that_is_wrong_and_sure_does_not_move_the_body_behind_the_camera():

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.upper_body.lifters import UNSURE
 from torchpose import PinholeCamera
 from torchpose.camera import project
 from torchpose.camera._tilt import Turn
@@ -97,11 +98,14 @@ def test_faces_and_necks_between_shoulders_are_turned_too(prior, method):
 
 
 def test_a_camera_that_is_known_to_be_level_changes_no_number_of_bones(prior, keypoints):
+    """It does change what is lifted from single frames, which is told from how far above a body is seen."""
     unknown = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
     assert kept_turn(LEVEL, prior) is None and kept_turn(unknown, prior) is None
-    trackers = (UpperBodyTracker(prior, camera, "articulated") for camera in (LEVEL, unknown))
-    tracks = [tracker(keypoints, names=NAMES) for tracker in trackers]
-    assert torch.equal(tracks[0].joints3d, tracks[1].joints3d)
+    for lifter in (UNSURE, None):
+        options = {"method": "articulated", "lifter": lifter}
+        trackers = (UpperBodyTracker(prior, camera, **options) for camera in (LEVEL, unknown))
+        known, other = (tracker(keypoints, names=NAMES).joints3d for tracker in trackers)
+        assert torch.equal(known, other) == (lifter is UNSURE)
 
 
 @pytest.mark.parametrize("method", ["articulated", "window-mixture", "mkf-fixed"])

@@ -98,6 +98,8 @@ class EndsAverage:
         wrists: whether hands are measured at the wrist. trust: factors on the covariances C of arms of which
             the elbow is measured, and of the others; None leaves covariances as they are. modesty: m.
         unit: how many times as large the person is known to be as those of the network.
+        level: whether pixels are known to be those of a level camera. Then it is known from how far below or
+            above a body is seen, by a network that looks at its neck (`_seen_from`).
     """
 
     def __init__(
@@ -109,9 +111,10 @@ class EndsAverage:
         trust: tuple[float, float] | None = None,
         modesty: float = 1.0,
         unit: float = 1.0,
+        level: bool = False,
     ) -> None:
         self.network, self.matrix, self.fps, self.wrists = network, matrix, fps, wrists
-        self.trust, self.modesty, self.unit = trust, modesty, unit
+        self.trust, self.modesty, self.unit, self.level = trust, modesty, unit, level
         self.forget = math.exp(-1 / (_MEMORY * fps))
 
     def init(self, batch_size: int) -> LiftedState:
@@ -133,7 +136,10 @@ class EndsAverage:
         seen, axes = from_neck(rays.index_select(2, rows), rays[:, :, _NECK])
         farthest = farthest_so_far(seen, given, state.farthest, self.fps)
         found = self._found(arm_features(seen, given, farthest, self.wrists))
-        ends = (found.ends.flatten(2, 3) @ axes.mT).unflatten(2, (2, 2))
+        told = found.ends
+        if self.level:
+            told = _seen_from(told, rays[:, :, _NECK, 1])
+        ends = (told.flatten(2, 3) @ axes.mT).unflatten(2, (2, 2))
         metres = poses.joints.index_select(2, limbs)[..., 2] / self.matrix[0, 0]
         pixels = _along_an_axis(poses.uv_covs.index_select(2, limbs)) * metres.square()
         variance = (self.unit * found.std).square() + pixels.unflatten(2, (2, 2))
@@ -219,7 +225,10 @@ def ends_average(
     network = _network_of(model, lifter, matrix)
     wrists = (model.hand or model.prior.info.hand) == "wrist"
     trusted = trust if model.calibrated else None
-    return EndsAverage(network, matrix, model.rate, wrists, trusted, modesty, unit)
+    level = (
+        model.pitch is not None
+    )  # keypoints of tilted cameras are turned, if their tilt is known
+    return EndsAverage(network, matrix, model.rate, wrists, trusted, modesty, unit, level)
 
 
 def _network_of(
@@ -289,6 +298,25 @@ def _placed(
     wanted = shoulders + ends[..., 0, :]
     elbows = torch.where(elbow, _nearest_on(elbows, wanted), wanted)
     return torch.stack([shoulders, elbows, hands], -2)
+
+
+def _seen_from(
+    ends: Float[Tensor, "B T 2 2 3"], slope: Float[Tensor, "B T"]
+) -> Float[Tensor, "B T 2 2 3"]:
+    """Return lifted arms as they are of bodies of which it is known from how far above they are seen.
+
+    Where the neck is an angle a below the horizon, arms keep their places across the image, and lean as an
+    upright body does in axes that look at its neck:
+
+        z' = z / cos a + y tan a
+
+    Args:
+        ends: elbows and hands from their shoulders, of bodies that are upright in these axes.
+        slope: tan a.
+    """
+    slope = slope[..., None, None]
+    x, y, z = ends.unbind(-1)
+    return torch.stack([x, y, z * (1 + slope.square()).sqrt() + y * slope], -1)
 
 
 def _nearest_on(rays: Float[Tensor, "*batch 3"], points: Float[Tensor, "*batch 3"]) -> Tensor:
