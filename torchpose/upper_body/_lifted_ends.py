@@ -225,9 +225,8 @@ def ends_average(
     network = _network_of(model, lifter, matrix)
     wrists = (model.hand or model.prior.info.hand) == "wrist"
     trusted = trust if model.calibrated else None
-    level = (
-        model.pitch is not None
-    )  # keypoints of tilted cameras are turned, if their tilt is known
+    # keypoints of cameras whose tilt is known are turned as level ones have them
+    level = model.pitch is not None
     return EndsAverage(network, matrix, model.rate, wrists, trusted, modesty, unit, level)
 
 
