@@ -139,6 +139,8 @@ def stage():
     m = MotionStage(10.0, 20.0, 30.0, 30.0)
     sizes = {"joints": (8, 3), "covs": (8, 3, 3), "angles": (3,), "place": (3,), "uv": (8, 2)}
     lengths = torch.tensor([6, 4])
+    seen = torch.ones(2, 6, dtype=torch.bool)
+    seen[1, :2] = False
 
     def reading(x):
         parts = {
@@ -147,7 +149,7 @@ def stage():
         return ReadOut(**parts, uv_covs=parts["covs"][..., :2, :2])
 
     def run(lag):
-        return lambda x: list(m(reading(x), lengths, lag))
+        return lambda x: list(m(reading(x), seen, lengths, lag))
 
     return {str(lag): (run(lag), POINTS(7, 2, 6, 72)) for lag in (0, 2, None)}
 

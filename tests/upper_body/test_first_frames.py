@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from tests.upper_body.test_articulated import ROW, body, pixels, tracker
+import torchpose
+from tests.upper_body.test_articulated import CAMERA, ROW, body, pixels, tracker
+from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._root_grid import RootGrid
 
 SETTLED = 16  # frames: half a second
@@ -138,3 +140,38 @@ def test_a_stream_finds_who_comes_late_as_the_whole_recording_does():
     for t, frame in enumerate(uv):
         state, pose = live.step(state, frame[None])
         torch.testing.assert_close(pose.joints3d, whole[:, t], rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def windows():
+    """The prior with windows."""
+    return torchpose.load_prior("kinect-upper-body")
+
+
+@pytest.mark.parametrize(
+    ("method", "smoothing"),
+    [("window-mixture", None), ("window-mixture", 20), ("multiple-model", None)],
+)
+def test_windows_begin_where_somebody_is_first_seen(windows, method, smoothing):
+    uv = pixels(body(10, depth=1.3), 2.0)  # far from the prior's place
+    seen = late(uv, 3, 13).repeat(2, 1, 1, 1)
+    seen[0, :10], seen[0, 10:] = uv, torch.nan
+    tracker = UpperBodyTracker(windows, CAMERA, method, fps=30.0, smoothing=smoothing)
+    at_once, found = tracker(seen, lengths=torch.tensor([10, 13])).joints3d
+    off = (found[3:] - at_once[:10]).norm(dim=-1)
+    if method == "window-mixture":
+        assert float(off.max()) < 1e-9
+    else:  # bones update their torso in other frames
+        assert float(off[:3].max()) < 0.03
+
+
+@pytest.mark.parametrize("method", ["window-mixture", "multiple-model"])
+def test_a_stream_of_windows_begins_there_too(windows, method):
+    uv = pixels(spread_arms(9), 2.0)
+    seen = torch.stack([late(uv, count, 9) for count in (0, 3, 7)])
+    live = UpperBodyTracker(windows, CAMERA, method, fps=30.0)
+    whole, state, found = live(seen).joints3d, live.init(3), []
+    for part in seen.split([1, 1, 2, 5], 1):
+        state, track = live.advance(state, part)
+        found.append(track.joints3d)
+    torch.testing.assert_close(torch.cat(found, 1), whole, rtol=0, atol=1e-9)

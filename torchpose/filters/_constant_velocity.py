@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Integer
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_positive, check_shape
@@ -100,7 +100,11 @@ class ConstantVelocityFilter(nn.Module):
         self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
         """Filter some more frames: the same numbers as `step` for one after the other."""
-        return _advanced(self._gains(), state, z)
+        known, found = self._gains(), []
+        for frame in z.unbind(1):
+            state, _ = _next(known, state, frame)
+            found.append(state.mean[:, 0])
+        return state, torch.stack(found, 1)
 
     def forward(
         self, z: Float[Tensor, "B T N"], *, lengths: Integer[Tensor, " B"] | None = None
@@ -184,8 +188,21 @@ class ConstantVelocityFilter(nn.Module):
         return f"ratio={float(self.ratio):g}, fps={float(self.fps):g}"
 
 
+class VelocityFiltersState(NamedTuple):
+    """State of `VelocityFilters`.
+
+    Attributes:
+        mean: [B, 2, N], as in `ConstantVelocityState`. time: frames since each sequence began, [B].
+    """
+
+    mean: Tensor
+    time: Tensor
+
+
 class VelocityFilters:
     """Filters of constant velocity, each over some of the numbers, which are advanced all at once.
+
+    Sequences begin when they are told to. Before, their numbers stay as they are.
 
     Args:
         filters: of one frame rate. counts: how many of the numbers each filters, one after the other.
@@ -201,25 +218,36 @@ class VelocityFilters:
             for gains in known
         ]
         counted = zip(columns, counts, strict=True)
-        joined = torch.cat([gains.expand(-1, -1, count) for gains, count in counted], -1)
-        self._gains = known[0]._replace(filter=joined)
+        gains = torch.cat([gains.expand(-1, -1, count) for gains, count in counted], -1)
+        at_rest = torch.zeros_like(gains[:1])
+        at_rest[:, 0] = 1.0
+        # by the number of frames of a sequence so far, of which the first one begins as it is, at rest
+        self._gains = torch.cat([at_rest, at_rest, gains[1:]])
+        self._matrix = known[0].matrix
+
+    def init(self, z: Float[Tensor, "B T N"]) -> VelocityFiltersState:
+        """Return the state before the first frame."""
+        times = torch.zeros(len(z), dtype=torch.long, device=z.device)
+        return VelocityFiltersState(z.new_zeros(len(z), 2, z.shape[-1]), times)
 
     def advance(
-        self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
-    ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
-        """Filter some more frames, as `ConstantVelocityFilter.advance`."""
-        return _advanced(self._gains, state, z)
+        self, state: VelocityFiltersState, z: Float[Tensor, "B T N"], seen: Bool[Tensor, "B T"]
+    ) -> tuple[VelocityFiltersState, Float[Tensor, "B T N"]]:
+        """Filter some more frames.
 
-
-def _advanced(
-    known: _Gains, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
-) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
-    """Return the state after some more frames, and their filtered numbers."""
-    found = []
-    for frame in z.unbind(1):
-        state, _ = _next(known, state, frame)
-        found.append(state.mean[:, 0])
-    return state, torch.stack(found, 1)
+        Args:
+            state: before them. z: the numbers. seen: the first frame in which it holds is the first one of a
+                sequence.
+        """
+        before = state.time[:, None]
+        times = before + (before + seen.cumsum(1) > 0).cumsum(1)
+        gains = self._gains.to(z)[times.clamp(max=len(self._gains) - 1)]
+        matrix, mean, found = self._matrix.to(z), state.mean, []
+        for frame, gain in zip(z.unbind(1), gains.unbind(1), strict=True):
+            predicted = matrix @ mean
+            mean = predicted + gain * (frame[:, None] - predicted[:, :1])
+            found.append(mean[:, 0])
+        return VelocityFiltersState(mean, times[:, -1]), torch.stack(found, 1)
 
 
 def _next(

@@ -4,7 +4,7 @@ A filter over windows estimates every frame alone, so that the noise of keypoint
 from one component to the next show as jitter. `MotionStage` filters (or smooths) what is read out.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import torch
@@ -23,8 +23,8 @@ from torchpose.camera._projection import (
 from torchpose.camera._virtual_camera import from_view
 from torchpose.filters._constant_velocity import (
     ConstantVelocityFilter,
-    ConstantVelocityState,
     VelocityFilters,
+    VelocityFiltersState,
 )
 from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 from torchpose.priors._arm_state import STATE_DIM
@@ -191,14 +191,15 @@ def recalibrated(
     return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
 
 
-MotionStageState = ConstantVelocityState
+MotionStageState = VelocityFiltersState
 """State of a `MotionStage`: of all its numbers, those of joints, then of pixels, then of the placement."""
 
 
 class MotionStage(nn.Module):
     """Constant-velocity filters over joints, their pixels and the body's placement.
 
-    Covariances stay as they are.
+    They begin where somebody is first seen. Before, poses are those of the prior, far from that person
+    perhaps. Covariances stay as they are.
 
     Args:
         joint_ratio, pixel_ratio, placement_ratio: q/r of `ConstantVelocityFilter`, 1/s^3. Pixels are
@@ -215,41 +216,59 @@ class MotionStage(nn.Module):
         self.placement = ConstantVelocityFilter(placement_ratio, fps)
 
     def forward(
-        self, reading: ReadOut, lengths: Int[Tensor, " B"] | None = None, lag: int | None = 0
+        self,
+        reading: ReadOut,
+        seen: Bool[Tensor, "B T"],
+        lengths: Int[Tensor, " B"] | None = None,
+        lag: int | None = 0,
     ) -> ReadOut:
-        """Return the poses with filtered or smoothed motion.
+        """Return the poses with filtered or smoothed motion, from where somebody is first seen.
 
         Args:
-            reading: the poses of whole sequences. lengths: the number of frames of each, [B]; frames past
-                it are not used.
+            reading: the poses of whole sequences. seen: in which frames anything was measured.
+            lengths: the number of frames of each, [B]; frames past it are not used.
             lag: the number of later frames that each may use; None is all, 0 only filters.
         """
         if lag == 0:
-            return self.advance(self.init(reading), reading)[1]
-        pairs = zip(self._filters(), _numbers(reading), strict=True)
-        return _with_numbers(
-            reading, *(model.smooth_frames(values, lengths, lag) for model, values in pairs)
-        )
+            return self.advance(self.init(reading), reading, seen)[1]
+        n_frames = seen.shape[1]
+        ends = torch.full_like(seen[:, 0], n_frames, dtype=torch.long)
+        ends = ends if lengths is None else lengths.to(ends)
+        unseen = (seen.cumsum(1) == 0).sum(1)
+        first = torch.where(unseen < ends, unseen, 0)[:, None]
+        frames = torch.arange(n_frames, device=seen.device)
+        known = frames >= first
+        smoothed = []
+        for model, values in zip(self._filters(), _numbers(reading), strict=True):
+            begun = _frames(values, (first + frames).clamp(max=n_frames - 1))
+            begun = model.smooth_frames(begun, ends - first[:, 0], lag)
+            begun = _frames(begun, (frames - first).clamp(min=0))
+            smoothed.append(torch.where(known[..., None], begun, values))
+        return _with_numbers(reading, *smoothed)
 
     def init(self, reading: ReadOut) -> MotionStageState:
         """Return the state before the first frame, that of `reading` [B, T, ...]."""
-        return self.joints.init(torch.cat(_numbers(reading), -1)[:, 0])
+        numbers = _numbers(reading)
+        return self._side_by_side(numbers).init(torch.cat(numbers, -1))
 
     def advance(
-        self, state: MotionStageState, reading: ReadOut
+        self, state: MotionStageState, reading: ReadOut, seen: Bool[Tensor, "B T"]
     ) -> tuple[MotionStageState, ReadOut]:
         """Return the next state and some more frames [B, T, ...]: the numbers of `forward` with lag 0."""
-        numbers, filters = _numbers(reading), self._filters()
-        counts = [values.shape[-1] for values in numbers]
+        numbers = _numbers(reading)
+        state, steady = self._side_by_side(numbers).advance(state, torch.cat(numbers, -1), seen)
+        return state, _with_numbers(reading, *steady.split([x.shape[-1] for x in numbers], -1))
+
+    def _side_by_side(self, numbers: Sequence[Tensor]) -> VelocityFilters:
+        """Return the filters of all numbers; made once."""
+        filters, counts = self._filters(), [values.shape[-1] for values in numbers]
         ratios = tuple(model.ratio for model in filters)
-        all_filters = derived(
+        return derived(
             self,
             ("all", *counts),
             (*ratios, self.joints.fps),
             lambda: VelocityFilters(filters, counts),
         )
-        state, steady = all_filters.advance(state, torch.cat(numbers, -1))
-        return state, _with_numbers(reading, *steady.split(counts, -1))
 
     def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
         return self.joints, self.pixels, self.placement
@@ -281,6 +300,11 @@ def stage_lag(smoothing: int | str | None, ahead: int) -> int | None:
 def _numbers(reading: ReadOut) -> tuple[Tensor, Tensor, Tensor]:
     placement = torch.cat([reading.angles, reading.place], -1)
     return reading.joints.flatten(2), reading.uv.flatten(2), placement
+
+
+def _frames(values: Float[Tensor, "B T N"], rows: Int[Tensor, "B T"]) -> Float[Tensor, "B T N"]:
+    """Return values of other frames."""
+    return values.gather(1, rows[..., None].expand_as(values))
 
 
 def _with_numbers(reading: ReadOut, joints: Tensor, pixels: Tensor, placement: Tensor) -> ReadOut:

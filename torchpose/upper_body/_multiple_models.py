@@ -163,7 +163,8 @@ class MultipleModelFilter(Estimator):
         articulated, bodies = self.articulated.advance(state.articulated, measured, progress)
         reading, motion = read_out(seen, self.matrix, self.order), state.motion
         if self._stage is not None:
-            motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
+            motion = motion or self._stage.init(reading)
+            motion, reading = self._stage.advance(motion, reading, measured.mask.any(-1))
         poses = in_camera_axes(reading, self.order)
         poses, apart = _held(poses, bodies, measured, state.apart)
         ends = self.ends.lift(state.lifted, bodies.seen_poses, measured.mask)
@@ -192,11 +193,11 @@ class MultipleModelFilter(Estimator):
             return super().forward(measured, joints, arm_generators, lengths, progress)
         seen = told = self.windows.forward(measured, joints, arm_generators, lengths)
         bodies = self.articulated.forward(measured, joints, arm_generators, lengths, progress)
-        poses = self._steadied(seen, lengths)
+        poses = self._steadied(seen, measured, lengths)
         if self.causal is not self.windows:
             told = self.causal.forward(measured, joints, arm_generators, lengths)
             half = torch.full_like(poses.place[..., 0], 0.5)
-            poses = _averaged(half, poses, self._steadied(told, lengths))
+            poses = _averaged(half, poses, self._steadied(told, measured, lengths))
         poses, _ = _held(poses, bodies, measured, self._unknown(len(poses.joints)))
         predicted = bodies
         if self.articulated.ahead:
@@ -218,11 +219,14 @@ class MultipleModelFilter(Estimator):
         """Return how far both models are apart before an arm was measured."""
         return self.matrix.new_full((batch_size, 43), math.nan)
 
-    def _steadied(self, seen: Estimates, lengths: Tensor | None) -> SeenPoses:
+    def _steadied(
+        self, seen: Estimates, measured: MeasuredJoints, lengths: Tensor | None
+    ) -> SeenPoses:
         """Return the poses of windows over whole sequences, after their motion stage."""
         reading, stage = read_out(seen, self.matrix, self.order), self._stage
         if stage is not None:
-            reading = stage(reading, lengths, stage_lag(self.model.smoothing, self.windows.ahead))
+            lag = stage_lag(self.model.smoothing, self.windows.ahead)
+            reading = stage(reading, measured.mask.any(-1), lengths, lag)
         return in_camera_axes(reading, self.order)
 
     @property

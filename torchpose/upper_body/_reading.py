@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera._pinhole import PinholeCamera
@@ -88,7 +88,9 @@ class PoseReader(NamedTuple):
         matrix, poses = self.prior.info.matrix_like(estimates.left.mean), estimates.poses
         if poses is None:
             reading = read_out(estimates, matrix, self.order)
-            motion, reading = self._steadied(motion, reading, estimates, lengths)
+            motion, reading = self._steadied(
+                motion, reading, estimates, found.measured.mask.any(-1), lengths
+            )
             poses = in_camera_axes(reading, self.order)
         poses = self._tilted(self._placed(poses, matrix, found.measured), matrix)
         notes = self.notes + outlier_notes(found.probability, found.exchanged, lengths)
@@ -103,6 +105,7 @@ class PoseReader(NamedTuple):
         motion: MotionStageState | None,
         reading: ReadOut,
         estimates: Estimates,
+        seen: Bool[Tensor, "B T"],
         lengths: Int[Tensor, " B"] | None,
     ) -> tuple[MotionStageState | None, ReadOut]:
         """Return the next state of the motion stage, and what it makes of the poses.
@@ -112,13 +115,13 @@ class PoseReader(NamedTuple):
         if self.stage is None:
             return None, reading
         if self.lag == 0:
-            return self.stage.advance(motion or self.stage.init(reading), reading)
+            return self.stage.advance(motion or self.stage.init(reading), reading, seen)
         batch, n_frames = reading.uv.shape[:2]
         ends = torch.full((batch,), n_frames) if lengths is None else lengths
         ends = ends.to(reading.uv.device)
         failed_at = first_failure(estimates.left, estimates.right)
         ends = torch.where(failed_at >= 0, torch.minimum(ends, failed_at.clamp_min(1)), ends)
-        return None, self.stage(reading, ends, self.lag)
+        return None, self.stage(reading, seen, ends, self.lag)
 
     def _track(
         self,
