@@ -12,6 +12,7 @@ from torchpose.errors import InputError
 from torchpose.filters._lengths import inside_lengths
 from torchpose.math._rotations import RotationOrder
 from torchpose.priors._upper_body_prior import UpperBodyPrior
+from torchpose.upper_body._camera_doubts import nearness_notes
 from torchpose.upper_body._estimator import (
     Bones,
     Estimates,
@@ -86,14 +87,17 @@ class PoseReader(NamedTuple):
                 repeated. None is T.
         """
         matrix, poses = self.prior.info.matrix_like(estimates.left.mean), estimates.poses
+        notes = self.notes
         if poses is None:
             reading = read_out(estimates, matrix, self.order)
             motion, reading = self._steadied(
                 motion, reading, estimates, found.measured.mask.any(-1), lengths
             )
             poses = in_camera_axes(reading, self.order)
+            if estimates.view is None:  # single poses
+                notes += nearness_notes(poses.joints, lengths)
         poses = self._tilted(self._placed(poses, matrix, found.measured), matrix)
-        notes = self.notes + outlier_notes(found.probability, found.exchanged, lengths)
+        notes += outlier_notes(found.probability, found.exchanged, lengths)
         if lengths is None:
             lengths = torch.full((len(poses.uv),), poses.uv.shape[1], device=poses.uv.device)
         else:

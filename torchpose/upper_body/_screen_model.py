@@ -158,7 +158,8 @@ def screen_model(
     Args:
         prior: the prior, in whose pixels the model is. camera: the camera of the keypoints; without an image
             size the image is taken to be twice as wide and high as its principal point is far from the
-            origin. fps: frames per second. joints: which of `UPPER_BODY` are among the keypoints.
+            origin (`guessed_size`). fps: frames per second. joints: which of `UPPER_BODY` are among the
+            keypoints.
         cov: R of each joint without any confidence, on the device to work on.
     """
     like = torch.zeros((), dtype=torch.float64, device=cov.device)
@@ -198,7 +199,7 @@ def largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"
 def _corners(prior: UpperBodyPrior, camera: PinholeCamera, like: Tensor) -> Float[Tensor, "2 2"]:
     """Return two opposite corners of the box, in the prior's pixels, that the image lies in."""
     own, wanted = camera.matrix.to(like), prior.info.matrix.to(like)
-    ends = torch.stack([like.new_zeros(2), _image_size(camera).to(like)])
+    ends = torch.stack([like.new_zeros(2), guessed_size(camera).to(like)])
     turn = kept_turn(camera, prior)
     if turn is None:
         return map_pixels(ends, own, wanted)
@@ -212,12 +213,16 @@ def _kind(name: str) -> str:
     return name.split("_")[0]
 
 
-def _image_size(camera: PinholeCamera) -> Float[Tensor, "2"]:
-    """Return width and height of the image, or a guess that is not much too small."""
+def guessed_size(camera: PinholeCamera) -> Float[Tensor, "2"]:
+    """Return width and height of the image, or a guess that is not much too small.
+
+    An image whose principal point is near its edge, or beside it, is cut from a larger one.
+    """
     if camera.image_size is not None:
         return torch.tensor(camera.image_size, dtype=torch.float64)
-    matrix = camera.matrix
-    return torch.maximum(2 * matrix[:2, 2], matrix.diagonal()[:2] / 2)
+    middle, focal = camera.matrix[:2, 2], camera.matrix.diagonal()[:2]
+    aside = 2 * middle < focal / 2
+    return torch.where(aside, middle.clamp_min(0.0) + focal, 2 * middle)
 
 
 def _subsets(present: tuple[bool, ...]) -> Float[Tensor, "S 8"]:

@@ -1,6 +1,7 @@
 """Track upper bodies: from 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Unpack
 
 import torch
@@ -37,6 +38,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import NECK_KINDS
 from torchpose.upper_body._absence import HANDS, absence_of
 from torchpose.upper_body._bridged_gaps import bridged_over_gaps
+from torchpose.upper_body._camera_doubts import size_notes
 from torchpose.upper_body._estimator import (
     Estimator,
     TrackerModel,
@@ -326,6 +328,9 @@ class UpperBodyTracker(WideModule):
                 found.measured, arm_joints(there), arms, lengths, progress
             )
             _, track = reader.read(None, estimates, found, lengths)
+            if self.outliers:
+                more = size_notes(self.camera, keypoints, given.mask, picked.indices)
+                track = replace(track, notes=track.notes + more)
         return note_collapse(track.in_precision(self.dtype))
 
     if TYPE_CHECKING:  # nn.Module has Any
