@@ -113,6 +113,21 @@ def test_single_precision_is_close(manifold) -> None:
     assert narrow.std_pose.dtype == torch.float32 and narrow.lengths.dtype == torch.long
 
 
+@pytest.mark.parametrize("name", ["poses", "scale", "weights", "bias", "gamma_x", "log_kernel"])
+def test_what_is_edited_counts_as_what_is_loaded(manifold, name: str) -> None:
+    changed, z = 1.02 * manifold.state_dict()[name], manifold.latents[:5].clone()
+    loaded, edited = copy.deepcopy(manifold), copy.deepcopy(manifold)
+    loaded.load_state_dict(manifold.state_dict() | {name: changed})
+    edited.state_dict()[name].copy_(changed)
+    want = loaded.pose_mean(z)
+    assert float((want - manifold.pose_mean(z)).abs().max()) > 1e-9
+    assert torch.equal(edited.pose_mean(z), want)
+    assert torch.equal(edited.latents, loaded.latents)
+    x = motion(5, seed=6)
+    found = torch.func.functional_call(manifold, {name: changed}, (x,))
+    torch.testing.assert_close(found, loaded(x), rtol=0, atol=0)
+
+
 def test_gradients_flow_through_both_maps(manifold) -> None:
     x = motion(2, seed=7).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: manifold.reconstruct(x).sum(-1), (x,), atol=1e-4)
@@ -121,6 +136,15 @@ def test_gradients_flow_through_both_maps(manifold) -> None:
 
 
 # --- fit
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_fit_needs_no_mode_of_gradients(mode) -> None:
+    whole = fit_gplvm(motion(40), steps=1, optimiser="adam")
+    with mode():
+        found = fit_gplvm(motion(40), steps=1, optimiser="adam")
+    assert torch.equal(found.weights, whole.weights)
+    assert not found.weights.requires_grad and not found.weights.is_inference()
 
 
 def test_held_out_poses_come_back_better_than_from_two_principal_components(manifold) -> None:

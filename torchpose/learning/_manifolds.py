@@ -21,6 +21,8 @@ _LEAST_SHARE = 0.05  # of the root mean square over all columns: a deviation tha
 _STRIDES = (2, 3, 4)  # frames, over which the growth of steps is looked at
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def fit_gplvm(
     poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
     latent_dim: int = 2,

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_rate, check_shape, check_tensors
-from torchpose._core.module_state import NoHalfModule
+from torchpose._core.module_state import NoHalfModule, derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose.errors import FileFormatError, InputError, ShapeError
@@ -100,9 +100,9 @@ class BackConstrainedGPLVM(NoHalfModule):
     g_i(x) = sum_t a_ti exp(-gamma_x / 2 ||x - x_t||^2) + b_i   (MR 21, 22)
 
     Use `torchpose.learning.fit_gplvm`; the constructor takes what a fit has found. The factor of the
-    kernel matrix and alpha = K^-1 X are computed once, so that the poses of any number of latent
-    points are a single product. `.float()` makes a manifold that predicts in single precision, from an
-    alpha computed in double.
+    kernel matrix and alpha = K^-1 X are computed once, and anew where the tensors below have changed, so
+    that the poses of any number of latent points are a single product. `.float()` makes a manifold that
+    predicts in single precision, from an alpha computed in double.
 
     Args:
         poses: training poses X [T, Q]; of bodies, columns without a unit (quaternion vectors).
@@ -115,7 +115,6 @@ class BackConstrainedGPLVM(NoHalfModule):
     Attributes:
         std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x
             [Q] (MR 29). All are for one frame, and NaN until `fit_gplvm_noise` has been called.
-        latents: z of the training poses [T, d].
 
     Raises:
         ShapeError: sizes do not fit together. InputError: values that are not finite, too few frames.
@@ -143,7 +142,6 @@ class BackConstrainedGPLVM(NoHalfModule):
     std_latent: Tensor
     std_pose: Tensor
     std_step: Tensor
-    latents: Tensor
 
     def __init__(
         self,
@@ -175,12 +173,10 @@ class BackConstrainedGPLVM(NoHalfModule):
         }  # fmt: skip
         for name, value in parts.items():
             check_finite(name, value)
-            self.register_buffer(name, value.detach().to(poses.device, torch.float64).clone())
-        self.register_buffer("lengths", lengths.detach().clone())
+            register_given(self, name, value.detach().to(poses.device, torch.float64))
+        register_given(self, "lengths", lengths)
         for name, value in no_noise(latent_dim, columns, self.poses)._asdict().items():
-            self.register_buffer(name, value)
-        self.register_load_state_dict_post_hook(_prepare_again)
-        self._prepare()
+            register_given(self, name, value)
 
     fit = staticmethod(moved_function("BackConstrainedGPLVM.fit", "torchpose.learning.fit_gplvm"))
     fit_noise = moved_function("fit_noise", "torchpose.learning.fit_gplvm_noise")
@@ -329,6 +325,11 @@ class BackConstrainedGPLVM(NoHalfModule):
         return int(self.poses.shape[1])
 
     @property
+    def latents(self) -> Float[Tensor, "T d"]:
+        """Return z of the training poses."""
+        return self._prepared.latents
+
+    @property
     def kernel(self) -> KernelParameters:
         """Return beta, beta_0, gamma_z and sigma_z."""
         return KernelParameters(*self.log_kernel.unbind())
@@ -392,7 +393,7 @@ class BackConstrainedGPLVM(NoHalfModule):
                 )  # fmt: skip
             except (InputError, ShapeError) as error:
                 raise FileFormatError(f"{path}: {error}") from error
-        if not all(bool(b.isfinite().all()) for b in (manifold.latents, *manifold._prepared)):
+        if not all(bool(b.isfinite().all()) for b in manifold._prepared):
             raise FileFormatError(f"{path}: its numbers make no manifold; fit it again")
         for name in MotionNoise._fields:
             getattr(manifold, name).copy_(kept[name])
@@ -406,17 +407,13 @@ class BackConstrainedGPLVM(NoHalfModule):
 
     @property
     def _prepared(self) -> Prepared:
-        return Prepared(self.latents, *(getattr(self, f"_{name}") for name in Prepared._fields[1:]))
-
-    def _prepare(self) -> None:
         """Return the tensors that prediction needs and that follow from the fit."""
-        for name, value in gplvm_prediction.prepare(self.poses, self._fitted)._asdict().items():
-            own = name if name == "latents" else f"_{name}"
-            self.register_buffer(own, value.to(self.poses.dtype), persistent=False)
+        sources = (self.poses, self.scale, self.weights, self.bias, self.gamma_x, self.log_kernel)
+        return derived(self, "prepared", sources, self._prepare)
+
+    def _prepare(self) -> Prepared:
+        found = gplvm_prediction.prepare(self.poses, self._fitted)
+        return Prepared(*(value.to(self.poses.dtype) for value in found))
 
     def _flat(self, z: Tensor) -> Float[Tensor, "N d"]:
         return z.reshape(-1, self.latent_dim).to(self.poses.dtype)
-
-
-def _prepare_again(manifold: BackConstrainedGPLVM, _: Any) -> None:
-    manifold._prepare()
