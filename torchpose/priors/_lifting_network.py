@@ -84,7 +84,8 @@ class LiftingNetwork(FittedNetwork):
     ) -> tuple[Lifted, Float[Tensor, "B L W"]]:
         """Return the joints of every frame, and the state of the recurrent network.
 
-        The standard deviations pass no gradients on to the layers that they share with the joints.
+        In training the standard deviations pass no gradients on to the layers that they share with the
+        joints.
 
         Args:
             seen: of `lifting_features`. memory: from the call before; None at the beginning.
@@ -92,7 +93,8 @@ class LiftingNetwork(FittedNetwork):
         before = None if memory is None else memory.transpose(0, 1).contiguous()
         features, after = self.cells(seen, before)
         joints = self.places(features).unflatten(-1, (_JOINTS, 3))
-        log_std = self.spread(features.detach())
+        shared = features.detach() if self.training else features
+        log_std = self.spread(shared)
         return Lifted(_UNIT * joints, _UNIT * log_std.exp()), after.transpose(0, 1)
 
 
