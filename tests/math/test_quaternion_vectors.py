@@ -9,7 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchpose.errors import ShapeError
+from torchpose.body import BODY_15, Body
+from torchpose.errors import InputError, ShapeError
 from torchpose.math import compose, conjugate, mean_rotation, quaternion_vector_to_matrix
 from torchpose.math._rotations import (
     matrix_to_quaternion_vector,
@@ -158,3 +159,26 @@ def test_wrong_sizes_are_named():
         quaternion_vector_to_matrix(torch.zeros(4))
     with pytest.raises(ShapeError, match="rotation must have shape"):
         matrix_to_quaternion_vector(torch.zeros(3, 4))
+
+
+def test_products_take_both_precisions():
+    first, second = torch.tensor([0.3, 0.1, -0.2]), torch.tensor([0.1, 0.5, 0.2])
+    want = compose(first.double(), second.double())
+    torch.testing.assert_close(compose(first, second.double()), want, rtol=0, atol=0)
+    body = Body.of_height(BODY_15, 1.7)
+    state = torch.full((body.dim,), 0.1)
+    assert body.perturb(state, 0.01 * state.double()).dtype == torch.float64
+
+
+def test_weights_of_a_mean():
+    vectors = torch.tensor([[0.3, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    weights = torch.tensor([[1.0, 0.0], [0.0, 0.0]]).double()
+    mean = mean_rotation(vectors.expand(2, 2, 3), weights)
+    torch.testing.assert_close(mean[0], vectors[0].double())
+    assert bool(mean[1].isnan().all())
+    with pytest.raises(InputError, match="weights must not be negative, got -2"):
+        mean_rotation(vectors, torch.tensor([1.0, -2.0]))
+    with pytest.raises(ShapeError, match=r"weights must have shape \[\.\.\., 2\], got \[1\]"):
+        mean_rotation(vectors, torch.ones(1))
+    with pytest.raises(InputError, match="at least one rotation, got none"):
+        mean_rotation(vectors[:0])

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.math.scipy_rotations import local, scipy
-from torchpose.errors import InputError
+from torchpose.errors import InputError, ShapeError
 from torchpose.math import (
     angle_to_edge,
     compose,
@@ -143,3 +143,30 @@ def test_bad_input():
         safe_centre(torch.zeros(2, 0, 3))
     with pytest.raises(InputError, match="vectors must be finite"):
         safe_centre(torch.full((4, 3), math.nan))
+
+
+@pytest.mark.parametrize("function", [fit_gaussian, angle_to_edge])
+def test_quaternions_and_nothing_are_no_rotations(function):
+    with pytest.raises(
+        ShapeError, match=r"vectors must have shape \[\.\.\., any, 3\], got \[5, 4\]"
+    ):
+        function(torch.zeros(5, 4))
+    with pytest.raises(InputError, match="expected at least one rotation, got none"):
+        function(torch.zeros(0, 3))
+
+
+def test_a_turn_by_a_quaternion_is_refused():
+    none, eye = torch.zeros(3), 0.01 * torch.eye(3)
+    with pytest.raises(ShapeError, match=r"rotation must have shape \[\.\.\., 3\], got \[4\]"):
+        rotate_gaussian(torch.zeros(4), none, eye)
+    with pytest.raises(ShapeError, match=r"mean must have shape \[\.\.\., 3\], got \[4\]"):
+        gaussian_rotate(torch.zeros(4), torch.eye(4), none)
+
+
+def test_turns_of_another_precision_are_taken():
+    turn, mean, cov = torch.tensor([0.5, -0.2, 0.3]), torch.full((3,), 0.1), 0.01 * torch.eye(3)
+    want = rotate_gaussian(turn.double(), mean.double(), cov.double())
+    torch.testing.assert_close(rotate_gaussian(turn, mean.double(), cov.double()), want)
+    want = gaussian_rotate(mean.double(), cov.double(), turn.double(), centre=turn.double())
+    found = gaussian_rotate(mean.double(), cov.double(), turn, centre=turn)
+    torch.testing.assert_close(found, want)

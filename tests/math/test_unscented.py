@@ -147,3 +147,17 @@ def test_bad_input():
         moments(torch.zeros(7, 3), torch.zeros(6))
     with pytest.raises(InputError, match="least must be a variance"):
         floor_eigenvalues(torch.eye(3), -1.0)
+
+
+@pytest.mark.parametrize(
+    ("measured", "noise", "message"),
+    [
+        (torch.ones(1), torch.eye(2), r"noise must have shape \[\.\.\., 1, 1\], got \[2, 2\]"),
+        (torch.ones(1), torch.eye(1), r"what function returns must have shape \[\.\.\., 6, 1\]"),
+        (torch.ones(2), torch.ones(2), r"noise must have shape \[\.\.\., 2, 2\], got \[2\]"),
+        (torch.tensor(1.0), torch.eye(2), r"measured must have shape \[\.\.\., Z\], got \[\]"),
+    ],
+)
+def test_an_update_by_other_sizes_is_refused(measured, noise, message):
+    with pytest.raises(ShapeError, match=message):
+        unscented_update(lambda x: x[..., :2], torch.zeros(3), torch.eye(3), measured, noise)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape, check_tensors
 from torchpose.errors import InputError
 from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._unscented import Directions, moments, sigma_points
@@ -75,8 +75,11 @@ def angle_to_edge(
 
     Returns:
         Radians [...]. Below half a radian a Gaussian over them is cut by the edge.
+
+    Raises:
+        ShapeError: the last dimension is not 3, as of quaternions. InputError: no rotation.
     """
-    local = vectors if centre is None else compose(conjugate(centre)[..., None, :], vectors)
+    local = _around(vectors, centre)
     quaternions = vector_to_quaternion(local)
     half = torch.atan2(quaternions[..., 3], quaternions[..., :3].norm(dim=-1))
     return 2 * half.amin(-1)
@@ -96,9 +99,20 @@ def fit_gaussian(
 
     Returns:
         Mean [..., 3] and covariance [..., 3, 3] of the quaternion vectors relative to the centre.
+
+    Raises:
+        ShapeError: the last dimension is not 3, as of quaternions, or another number of weights.
+        InputError: no rotation.
     """
-    local = vectors if centre is None else compose(conjugate(centre)[..., None, :], vectors)
-    return moments(local, log_weights)
+    return moments(_around(vectors, centre), log_weights)
+
+
+def _around(vectors: Tensor, centre: Tensor | None) -> Float[Tensor, "*batch N 3"]:
+    """Return checked rotations relative to a centre."""
+    check_shape("vectors", vectors, ["...", None, 3])
+    if vectors.shape[-2] == 0:
+        raise InputError("expected at least one rotation, got none")
+    return vectors if centre is None else compose(conjugate(centre)[..., None, :], vectors)
 
 
 def rotate_gaussian(
@@ -126,8 +140,13 @@ def rotate_gaussian(
     Returns:
         mu' [..., 3] and Sigma' [..., 3, 3], symmetric. See the module for what happens at its edge.
 
+    Raises:
+        ShapeError: sizes that do not go together, as of a quaternion. InputError: no tensors, or unknown
+            directions.
+
     Reference: Daubney & Xie, section 3.3 and equation (3).
     """
+    _check_turn(rotation, mean, covariance)
     left = rotation if centre is None else compose(rotation, centre)
     left = left if new_centre is None else compose(conjugate(new_centre), left)
     return turn_gaussian(mean, covariance, left=left, directions=directions)
@@ -158,12 +177,23 @@ def gaussian_rotate(
     Returns:
         mu' [..., 3] and Sigma' [..., 3, 3], symmetric.
 
+    Raises:
+        ShapeError, InputError: as `rotate_gaussian`.
+
     Reference: Daubney & Xie, section 3.3 and equation (10).
     """
+    _check_turn(rotation, mean, covariance)
     left = centre
     if new_centre is not None:
         left = conjugate(new_centre) if centre is None else compose(conjugate(new_centre), centre)
     return turn_gaussian(mean, covariance, left=left, right=rotation, directions=directions)
+
+
+def _check_turn(rotation: Tensor, mean: Tensor, covariance: Tensor) -> None:
+    """Raise unless a rotation and a mean are vectors of three numbers."""
+    check_tensors(rotation=rotation, mean=mean, covariance=covariance)
+    for name, vector in (("rotation", rotation), ("mean", mean)):
+        check_shape(name, vector, ["...", 3])
 
 
 def turn_gaussian(
@@ -187,12 +217,12 @@ def turn_gaussian(
     """
     quaternions = sigma_quaternions(mean, covariance, directions)
     if left is not None:
-        turn = left_matrix(vector_to_quaternion(left))
+        turn = left_matrix(vector_to_quaternion(left.to(quaternions)))
         if right is not None:
-            turn = turn @ right_matrix(vector_to_quaternion(right))
+            turn = turn @ right_matrix(vector_to_quaternion(right.to(quaternions)))
         quaternions = quaternions @ turn.mT
     elif right is not None:
-        quaternions = quaternions @ right_matrix(vector_to_quaternion(right)).mT
+        quaternions = quaternions @ right_matrix(vector_to_quaternion(right.to(quaternions))).mT
     return quaternion_moments(quaternions)
 
 

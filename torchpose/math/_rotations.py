@@ -15,7 +15,9 @@ from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_floating, check_shape
 from torchpose._core.module_state import outside_inference
+from torchpose._core.value_checks import values_visible
 from torchpose._core.value_pairs import as_pair
+from torchpose.errors import InputError
 from torchpose.math._gaussian import safe_eigh
 
 RotationOrder = Literal["zxy", "zyx"]
@@ -285,7 +287,9 @@ def compose(
     """
     for name, vector in (("first", first), ("second", second)):
         check_shape(name, vector, ["...", 3])
-    return quaternion_to_vector(_product(vector_to_quaternion(first), vector_to_quaternion(second)))
+    dtype = torch.promote_types(first.dtype, second.dtype)
+    factors = (vector_to_quaternion(vector.to(dtype)) for vector in (first, second))
+    return quaternion_to_vector(_product(*factors))
 
 
 def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -342,17 +346,24 @@ def mean_rotation(
         weights: [..., N], not negative; equal ones by default.
 
     Returns:
-        Quaternion vector [..., 3] in the unit ball; NaN where a rotation or a weight is.
+        Quaternion vector [..., 3] in the unit ball; NaN where a rotation or a weight is, and where all
+        weights are zero.
 
     Raises:
-        ShapeError: the last dimension is not 3.
+        ShapeError: the last dimension is not 3, or another number of weights. InputError: no rotation, or
+            a negative weight.
 
     Reference: Markley, Cheng, Crassidis & Oshman, Averaging quaternions, 2007, equation (12).
     """
     check_shape("vectors", vectors, ["...", None, 3])
+    if vectors.shape[-2] == 0:
+        raise InputError("a mean needs at least one rotation, got none")
     quaternions = vector_to_quaternion(vectors)
-    weighted = quaternions if weights is None else quaternions * weights[..., None]
-    matrix = weighted.mT @ quaternions
+    weighted = quaternions
+    if weights is not None:
+        _check_weights(weights, vectors.shape[-2])
+        weighted = quaternions * weights[..., None]
+    matrix = weighted.mT @ quaternions.to(weighted.dtype)
     mean = safe_eigh(matrix.detach())[1][..., -1]
     # eigenvalues that are equal, as of turns about one axis, have no gradients
     if torch.is_grad_enabled():
@@ -361,7 +372,19 @@ def mean_rotation(
         same = safe_eigh(matrix + torch.diag_embed(apart))[1][..., -1]
         same = same * (same * mean).detach().sum(-1, keepdim=True).sign()
         mean = mean + (same - same.detach())
+    if weights is not None:
+        mean = mean.masked_fill((weights == 0).all(-1, keepdim=True), math.nan)
     return quaternion_to_vector(mean)
+
+
+def _check_weights(weights: Tensor, count: int) -> None:
+    """Raise unless there is a weight for each of `count` rotations, and none is negative."""
+    check_shape("weights", weights, ["...", count])
+    if values_visible() and bool((weights < 0).any()):
+        raise InputError(
+            f"weights must not be negative, got {float(weights.detach().min()):.3g}; take the exponential of "
+            "log-weights"
+        )
 
 
 class RigidMotion(NamedTuple):

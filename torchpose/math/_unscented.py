@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose._core.checks import check_choice, check_shape
+from torchpose._core.checks import check_choice, check_shape, check_tensors
 from torchpose.errors import InputError
 from torchpose.math._gaussian import condition, safe_cholesky, safe_eigh, symmetrise
 
@@ -154,10 +154,19 @@ def unscented_update(
 
     Returns:
         mu' [..., D], Sigma' [..., D, D] and the log-likelihood log N(z; mu_h, S) [...].
+
+    Raises:
+        ShapeError: sizes that do not go together. InputError: no tensors, or unknown directions.
     """
+    check_tensors(mean=mean, covariance=covariance, measured=measured, noise=noise)
     points = sigma_points(mean, covariance, centre=centre, directions=directions)
-    dim = points.shape[-1]
-    joint_mean, joint = moments(torch.cat([points, function(points)], -1))
+    dim, count = points.shape[-1], (measured.shape or (1,))[-1]
+    check_shape("measured", measured, ["...", "Z"])
+    check_shape("noise", noise, ["...", count, count])
+    seen = function(points)
+    check_tensors(**{"what function returns": seen})
+    check_shape("what function returns", seen, ["...", points.shape[-2], count])
+    joint_mean, joint = moments(torch.cat([points, seen], -1))
     joint = joint + pad(noise, (dim, 0, dim, 0))
     given = torch.arange(dim, joint_mean.shape[-1], device=mean.device)
     return condition(joint_mean, joint, given, measured)
