@@ -199,3 +199,13 @@ def test_error_left_on_recordings(folder, pattern, limit):
     errors = fit_errors(body, fit_state(body, joints), joints)
     assert float(errors.nanmean()) < limit
     assert 1.4 < body.height < 2.0
+
+
+@pytest.mark.parametrize("unit", [1000.0, 100.0, 3.28])
+def test_joints_in_other_units_are_refused(unit):
+    body = Body.of_height(BODY_15, 1.7)
+    joints = unit * body.joints(torch.zeros(3, body.dim, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"joints must be in metres, as the body is, got bones of"):
+        fit_state(body, joints)
+    with pytest.raises(InputError, match="the height of the body of these joints must lie between"):
+        fit_body(joints)

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose._core.checks import check_shape, check_tensors
+from torchpose._core.checks import check_height, check_shape, check_tensors
 from torchpose._core.facade import set_up_facade
 from torchpose._core.rows import where_rows
 from torchpose.body._kinematics import Body, Frame
@@ -33,6 +33,9 @@ _TORSO_TILT = 1e-2  # square metres, weight of the torso's tilt where the hips d
 _LEAST_TILT = 1e-9  # and where they do
 _DAMPING = 1e-6  # square metres, of Gauss-Newton: keeps the twist where it is, at least
 _MOST_DAMPING = 1e3  # frames that no step makes better stay where they are
+_MOST_SCALE = (
+    3.0  # of somebody's bones beside those of the body: more are other units, feet included
+)
 _ROUNDS = 4  # of rigid shapes and rotations in turn; the change is below 0.1 mm after three
 _CHUNK = 2048  # frames per Gauss-Newton step, 30 MB of Jacobians
 
@@ -69,14 +72,14 @@ def fit_body(
 
     Raises:
         InputError: a joint is missing in some frames only, a bone has no length, no joint of the
-            pelvis or torso. ShapeError: another number of joints.
+            pelvis or torso, or joints in other units than metres. ShapeError: another number of joints.
     """
     check_tensors(joints=joints)
     joints = joints.double()
     roles, known = _roles(skeleton), _known_joints(skeleton, joints)
     bones = _bones(skeleton, joints)
     lengths = bones.norm(dim=-1).median(0).values
-    height = skeleton.height(lengths)
+    height = check_height(skeleton.height(lengths), "the height of the body of these joints")
     lengths = torch.where(known, lengths, skeleton.standard_lengths(height).to(lengths))
     radii = skeleton.standard_radii(height) if radii is None else radii
     body = Body(skeleton, lengths, radii.to(lengths), frame=frame)
@@ -133,13 +136,14 @@ def fit_state(body: Body, joints: Float[Tensor, "T J 3"], steps: int = 4) -> Flo
 
     Raises:
         InputError: a joint is missing in some frames only, or wholly where pelvis and torso need
-            it. ShapeError: another number of joints.
+            it, or joints in other units than the body. ShapeError: another number of joints.
     """
     if steps < 0:
         raise InputError(f"steps must not be negative, got {steps}")
     check_tensors(joints=joints)
     joints = joints.to(body.offsets)
     known = _known_joints(body.skeleton, joints)
+    _check_units(body, joints, known)
     tilt, chunks = _tilt_of(body, joints), joints.split(_CHUNK)
     tilts = [tilt._replace(seen=seen) for seen in tilt.seen.split(_CHUNK)]
     fits = zip(chunks, tilts, strict=True)
@@ -362,6 +366,18 @@ def _roles(skeleton: BodySkeleton) -> _Roles:
             same = above > 0 and skeleton.part_of[above] == skeleton.part_of[j]
             pivots[j] = pivots[above] if same else above
     return _Roles(parts, rigid, learnt, axes, pivots, spine)
+
+
+def _check_units(body: Body, joints: Tensor, known: Bool[Tensor, " J"]) -> None:
+    """Raise `InputError` where the lengths of bones say that joints are in other units than the body."""
+    own = body.offsets.detach().norm(dim=-1)
+    lengths = _bones(body.skeleton, joints.detach()).norm(dim=-1).median(0).values
+    times = float((lengths / own)[known & (own > 0)].median())
+    if not 1 / _MOST_SCALE < times < _MOST_SCALE:
+        raise InputError(
+            f"joints must be in metres, as the body is, got bones of {times:.4g} times the lengths of its "
+            "own; divide millimetres by 1000 and centimetres by 100"
+        )
 
 
 def _bones(skeleton: BodySkeleton, joints: Tensor) -> Tensor:
