@@ -88,6 +88,15 @@ def test_other_dtypes(dtype, tolerance):
     torch.testing.assert_close(back, points, rtol=0, atol=tolerance)
 
 
+def test_points_and_cameras_of_both_precisions():
+    points, R, t = scene(2, 3, dtype=torch.float32)
+    wide = project(points.double(), K, R.double(), t.double())
+    torch.testing.assert_close(project(points, K, R, t), wide, rtol=0, atol=0)
+    back = lift(wide.float(), K, R, t)
+    assert back.dtype == torch.float64
+    torch.testing.assert_close(back, points.double(), rtol=0, atol=1e-5)
+
+
 def test_leading_dimensions_broadcast():
     points, R, t = scene(4)
     many = project(points[0], K, R, t)  # one body, four views

@@ -237,3 +237,11 @@ def test_bad_input(bank, spaces):
     named = fit_action_space(performances(5), 4, name="bend")
     with pytest.raises(InputError, match="without a frame rate"):
         ActionBank([named]).recognise(torch.zeros(2, 36).double())
+
+
+def test_files_of_single_precision_are_read_in_double(bank, tmp_path):
+    narrow = copy.deepcopy(bank).float()
+    narrow.save(tmp_path / "bank.safetensors")
+    back = ActionBank.load(tmp_path / "bank.safetensors")
+    assert {value.dtype for value in back.buffers() if value.is_floating_point()} == {torch.float64}
+    torch.testing.assert_close(back.std, narrow.std.double(), rtol=0, atol=0)

@@ -1,5 +1,6 @@
 """The action space: against a plain PCA, its gate against sampling, files, and what is refused."""
 
+import copy
 import math
 import warnings
 
@@ -159,6 +160,14 @@ def test_files(space, tmp_path):
         ActionSpace.load(path)
     with pytest.raises(InputError, match="no_such"):
         ActionSpace.load(tmp_path / "no_such.safetensors")
+
+
+def test_files_of_single_precision_are_read_in_double(space, tmp_path):
+    narrow = copy.deepcopy(space).float()
+    narrow.save(tmp_path / "space.safetensors")
+    back = ActionSpace.load(tmp_path / "space.safetensors")
+    assert {value.dtype for value in back.buffers() if value.is_floating_point()} == {torch.float64}
+    torch.testing.assert_close(back.std, narrow.std.double(), rtol=0, atol=0)
 
 
 def test_limbs_of_other_names(space):

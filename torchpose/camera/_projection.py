@@ -5,7 +5,7 @@ Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect moti
 function is differentiable, takes any dtype and broadcasts over leading dimensions."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, reduce
 from typing import NamedTuple, Self
 
 import torch
@@ -52,9 +52,16 @@ def project(
     """
     check_shape("points", points, ["...", None, 3])
     _check_pose(K, R, t)
+    points, K, R, t = _of_one_precision(points, K, R, t)
     homogeneous = (points @ R.mT + t.unsqueeze(-2)) @ K.mT
     depth = homogeneous[..., 2:]
     return torch.cat([homogeneous[..., :2] / depth, depth], -1)
+
+
+def _of_one_precision(*values: Tensor) -> list[Tensor]:
+    """Return tensors in the precision of the most precise one."""
+    dtype = reduce(torch.promote_types, (value.dtype for value in values))
+    return [value.to(dtype) for value in values]
 
 
 def backproject(
@@ -137,6 +144,7 @@ def lift(
     Reference: Burke & Lasenby, equation (5).
     """
     _check_pose(K, R, t)
+    uvl, K, R, t = _of_one_precision(uvl, K, R, t)
     return (backproject(uvl, K) - t.unsqueeze(-2)) @ R
 
 

@@ -399,7 +399,7 @@ class ActionBank(NoHalfModule):
         NoHalfModule.__init__(bank)
         bank.info = info
         for name, value in tensors.items():
-            bank.register_buffer(name, value)
+            bank.register_buffer(name, value if name in BANK_FILE.indices else value.double())
         return bank
 
     # --- pieces -----------------------------------------------------------------------------------

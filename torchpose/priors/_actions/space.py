@@ -376,7 +376,7 @@ class ActionSpace(NoHalfModule):
         """
         info, tensors = read_tensors(path, SPACE_FILE)
         with reading(path, "an action space"):
-            return cls(**tensors, info=info)
+            return cls(**{name: value.double() for name, value in tensors.items()}, info=info)
 
     def check_for(self, limbs: Sequence[str]) -> None:
         """Check that postures are of the limbs that this action is of.
