@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 from tests.data import data_dir_or_skip
 from tests.priors.mixtures import long_double_log_prob, random_mixture, released_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
+from torchpose.filters import FixedTrackFilter
 from torchpose.priors import GaussianMixture
 
 
@@ -278,3 +279,38 @@ def test_a_shape_of_draws_that_is_none_is_named(shape):
     mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     with pytest.raises(InputError, match=r"shape must be a sequence of sizes, such as \(5,\), got"):
         mixture.sample(shape)
+
+
+def test_a_covariance_that_was_learnt_out_of_its_range_is_named() -> None:
+    kind = {"dtype": torch.float64}
+    covariances = torch.nn.Parameter(torch.eye(2, **kind).repeat(2, 1, 1))
+    mixture = GaussianMixture(torch.full((2,), 0.5, **kind), torch.zeros(2, 2, **kind), covariances)
+    with torch.no_grad():
+        covariances[1] = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
+    point, noise = torch.zeros(2, **kind), torch.ones(2)
+    for use in (
+        lambda: mixture.log_prob(point),
+        lambda: mixture.sample((3,)),
+        lambda: mixture.condition([1], point[:1]),
+        lambda: FixedTrackFilter(mixture, noise, noise[:1], [0]),
+    ):
+        with pytest.raises(CovarianceError, match=r"not at index \[1\]; what is learnt stays"):
+            use()
+
+
+def test_lists_arrays_and_seeds_are_told_what_to_give() -> None:
+    mixture = random_mixture()
+    for use in (
+        lambda: mixture.log_prob([0.0, 0.0, 0.0]),
+        lambda: mixture.log_prob(np.zeros(3)),
+        lambda: mixture.condition([0], [0.0]),
+        lambda: GaussianMixture.fit(np.zeros((9, 2)), 1),
+    ):
+        with pytest.raises(
+            InputError, match=r"must be a tensor, got .*; convert it with torch.as_tensor"
+        ):
+            use()
+    with pytest.raises(
+        InputError, match=r"generator must be a torch.Generator, got 3; torch.Generator"
+    ):
+        mixture.sample((2,), generator=3)

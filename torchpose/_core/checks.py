@@ -248,6 +248,19 @@ def check_count(name: str, value: int) -> None:
         raise InputError(f"{name} must be at least 1, got {value}")
 
 
+def check_generator(generator: Any, wanted: str = "a torch.Generator") -> None:
+    """Raise `InputError` unless this is a source of random numbers, or None.
+
+    Args:
+        generator: to look at. wanted: for the message.
+    """
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise InputError(
+            f"generator must be {wanted}, got {generator!r:.60}; torch.Generator().manual_seed(0) makes one "
+            "of a seed"
+        )
+
+
 def check_seed(name: str, seed: int) -> None:
     """Raise `InputError` unless a seed is a whole number that all generators take."""
     if not (isinstance(seed, Integral) and 0 <= seed < _SEEDS):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_generator
 from torchpose.errors import InputError
 
 
@@ -92,12 +93,13 @@ def sample_viewpoints(
         `Viewpoints` with angles [n, 3] and translation [n, 3].
 
     Raises:
-        InputError: n is negative.
+        InputError: n is negative, or no generator.
 
     Reference: Burke & Lasenby, section 3.1 (angles up to 30 degrees, translations up to 0.5 m).
     """
     if n < 0:
         raise InputError(f"n must not be negative, got {n}")
+    check_generator(generator)
     r = view_range
     limits = [(-r.roll, r.roll), (-r.pitch, r.pitch), (-r.yaw, r.yaw), r.tx, r.ty, r.tz]
     device = generator.device if generator is not None else None

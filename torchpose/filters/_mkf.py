@@ -32,6 +32,7 @@ from torchpose.filters._transition import (
     make_transition,
 )
 from torchpose.filters._weights import normalise
+from torchpose.math._gaussian import definite_cholesky
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 
@@ -242,6 +243,8 @@ class MixtureKalmanFilter(RecursiveFilter):
 
     def _make_transition(self, inflated: float) -> Transition:
         wide = torch.float64
+        if self.covariances.requires_grad:
+            definite_cholesky("covariances of the prior", self.covariances.detach().to(wide))
         return make_transition(
             self.transition_kind,
             self.means.to(wide),

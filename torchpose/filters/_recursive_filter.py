@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_generator, check_shape
 from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
 from torchpose._core.module_state import (
     WideModule,
@@ -87,11 +87,7 @@ def check_generators(generator: Generators, batch: int) -> None:
     several = isinstance(generator, Sequence)
     each: Sequence[Any] = generator if isinstance(generator, Sequence) else [generator]
     for one in each:
-        if not isinstance(one, torch.Generator):
-            raise InputError(
-                f"generator must be a torch.Generator, or a list of them, got {one!r:.60}; "
-                "torch.Generator().manual_seed(0) makes one of a seed"
-            )
+        check_generator(one, "a torch.Generator, or a list of them")
     if several and len(each) != batch:
         raise InputError(
             f"a list of generators must hold {batch}, one for each sequence, got {len(each)}"

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from torchpose._core.checks import check_shape, check_tensors
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import InputError, ShapeError
+from torchpose.errors import CovarianceError, InputError, ShapeError
 
 LOG_2PI = math.log(2 * math.pi)
 _JITTER = (1e-14, 1e-12, 1e-10, 1e-8, 1e-6)
@@ -43,6 +43,25 @@ def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
         Lower triangular L [..., D, D] with L L^T = matrix.
     """
     return mended_cholesky(matrix)[0]
+
+
+def definite_cholesky(name: str, matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
+    """Return the factors of `safe_cholesky`, or raise where covariances that were right are none any more.
+
+    Args:
+        name: of the covariances, for the message. matrix: [..., D, D], symmetric.
+
+    Raises:
+        CovarianceError: a matrix that is indefinite by more than rounding, as after a step of an optimiser.
+    """
+    factor = safe_cholesky(matrix)
+    lost = factor.diagonal(dim1=-2, dim2=-1).isnan().any(-1)
+    if values_visible() and bool(lost.any()):
+        raise CovarianceError(
+            f"{name} must be positive definite, got one that is not at index {lost.nonzero()[0].tolist()}; "
+            "what is learnt stays a covariance as L L^T of a parameter L"
+        )
+    return factor
 
 
 def safe_eigh(

@@ -16,13 +16,15 @@ from torchpose._core.checks import (
     check_count,
     check_covariance,
     check_finite,
-    check_real,
+    check_generator,
     check_shape,
+    check_tensors,
     check_weights,
 )
 from torchpose._core.module_state import NoHalfModule, register_given
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError, ShapeError
-from torchpose.math._gaussian import mixture_moments, symmetrise
+from torchpose.math._gaussian import definite_cholesky, mixture_moments, symmetrise
 from torchpose.math._mixture_em import FitReport, MixtureParameters, expectation_maximisation
 from torchpose.math._mixture_start import STARTS, floor_variances, start_mixture
 
@@ -239,9 +241,12 @@ class GaussianMixture(NoHalfModule):
         return mixture
 
     def cholesky(self) -> Float[Tensor, "K D D"]:
-        """Return lower factors L_k of the covariances, Sigma_k = L_k L_k^T (factorised in float64)."""
-        factor = torch.linalg.cholesky(symmetrise(self.covariances.double()))
-        return factor.to(self.covariances.dtype)
+        """Return lower factors L_k of the covariances, Sigma_k = L_k L_k^T (factorised in float64).
+
+        Raises:
+            CovarianceError: a covariance that was learnt is not positive definite any more.
+        """
+        return _factors(self.covariances)
 
     def component_log_prob(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch K"]:
         """Return the log of each term of the mixture, log pi_k + log N(x; mu_k, Sigma_k).
@@ -253,10 +258,11 @@ class GaussianMixture(NoHalfModule):
             [..., K], natural logarithm.
 
         Raises:
-            ShapeError: the last dimension is not D. InputError: complex points.
+            ShapeError: the last dimension is not D. InputError: no tensor, or complex points.
+            CovarianceError: as `cholesky`.
         """
+        check_tensors(x=x)
         check_shape("x", x, ("...", self.dim))
-        check_real("x", x)
         return self.weights.log() + component_log_density(x, self.means, self.cholesky())
 
     def log_prob(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
@@ -269,7 +275,8 @@ class GaussianMixture(NoHalfModule):
             [...], natural logarithm.
 
         Raises:
-            ShapeError: the last dimension is not D. InputError: complex points.
+            ShapeError: the last dimension is not D. InputError: no tensor, or complex points.
+            CovarianceError: as `cholesky`.
         """
         return self.component_log_prob(x).logsumexp(-1)
 
@@ -304,8 +311,9 @@ class GaussianMixture(NoHalfModule):
             Draws [*shape, D], in the dtype of the mixture.
 
         Raises:
-            InputError: a shape that is no sequence of sizes, such as 5 in place of (5,).
+            InputError: a shape that is no sequence of sizes, such as 5 in place of (5,), or no generator.
         """
+        check_generator(generator)
         shape = _sizes(shape)
         n = math.prod(shape)
         weights = self.weights
@@ -365,13 +373,12 @@ class GaussianMixture(NoHalfModule):
             complex values.
         """
         seen = self._indices(indices)
+        check_tensors(values=values)
         check_shape("values", values, ("...", len(seen)))
-        check_real("values", values)
         hidden = torch.ones(self.dim, dtype=torch.bool, device=seen.device)
         hidden[seen] = False
         order = torch.cat([seen, hidden.nonzero().squeeze(-1)])
-        covariance = self.covariances.double()[:, order][:, :, order]
-        factor = torch.linalg.cholesky(symmetrise(covariance)).to(self.means.dtype)
+        factor = _factors(self.covariances[:, order][:, :, order])
         n = len(seen)
         seen_factor, cross, hidden_factor = factor[:, :n, :n], factor[:, n:, :n], factor[:, n:, n:]
         mean = self.means[:, order]
@@ -396,6 +403,15 @@ class GaussianMixture(NoHalfModule):
         return index
 
 
+def _factors(covariances: Float[Tensor, "K D D"]) -> Float[Tensor, "K D D"]:
+    """Return the factors of covariances, computed in float64."""
+    wide = symmetrise(covariances.double())
+    # traced, it would be factorised with every jitter
+    seen = values_visible()
+    factor = definite_cholesky("covariances", wide) if seen else torch.linalg.cholesky(wide)
+    return factor.to(covariances.dtype)
+
+
 def _sizes(shape: Sequence[int]) -> torch.Size:
     """Return a shape, or raise `InputError` for what is none."""
     try:
@@ -416,6 +432,7 @@ def _components(weights: Tensor, uniform: Tensor) -> Tensor:
 def _check_fit(
     x: Tensor, n_components: int, n_init: int, covariance_floor: float, init: str
 ) -> None:
+    check_tensors(x=x)
     check_shape("x", x, ("N", "D"))
     check_finite("x", x, hint="drop frames with missing joints before the fit")
     check_count("n_components", n_components)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_finite, check_shape
+from torchpose._core.checks import check_finite, check_generator, check_shape
 from torchpose._core.module_state import NoHalfModule, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
@@ -232,8 +232,9 @@ class ActionSpace(NoHalfModule):
             Indices [...] from 0 to K - 1.
 
         Raises:
-            ShapeError: another number of dimensions.
+            ShapeError: another number of dimensions. InputError: no generator.
         """
+        check_generator(generator)
         uniform = torch.rand(z.shape[:-1], generator=generator, dtype=z.dtype, device=z.device)
         return match_postures(self.log_match(z), uniform)
 
