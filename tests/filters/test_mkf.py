@@ -246,6 +246,13 @@ def test_transitions_take_one_rate_and_no_variances():
     torch.testing.assert_close(one, each)
     with pytest.raises(ShapeError, match=r"process_cov must have shape \[4, 4\], got \[4\]"):
         make_transition("paper", means, covs, torch.ones(DIM).double())
+    with pytest.raises(ShapeError, match=r"gamma must have shape \[3\], got \[4\]"):
+        make_transition("ou", means, covs, torch.eye(DIM).double(), torch.full((DIM,), 0.9))
+    for options in ({"gamma": 0.9}, {"subspace": 2}):
+        with pytest.raises(
+            InputError, match=r"does not apply to transition 'paper'; it is of 'ou'"
+        ):
+            make_transition("paper", means, covs, torch.eye(DIM).double(), **options)
 
 
 @pytest.mark.parametrize("kind", ["paper", "stationary", "ou", "subspace"])

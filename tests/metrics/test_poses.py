@@ -380,3 +380,12 @@ def test_without_torchmetrics_the_message_says_what_to_do(monkeypatch) -> None:
     monkeypatch.delitem(sys.modules, "torchpose.metrics._torchmetrics_adapters", raising=False)
     with pytest.raises(MissingDependencyError, match="pip install torchmetrics"):
         importlib.import_module("torchpose.metrics._torchmetrics_adapters")
+
+
+def test_chains_are_no_limbs_and_one_joint_does_not_align():
+    poses = torch.rand(2, 8, 3, generator=torch.Generator().manual_seed(0))
+    for limbs in ([(0, 1, 2), (3, 4, 5)], [0, 1], [(0.0, 1.0)]):
+        with pytest.raises(InputError, match="limbs must be pairs of joints below 8"):
+            metrics.pcp(poses, poses, limbs=limbs)
+    with pytest.raises(InputError, match="joints must be three or more different indices"):
+        metrics.align(poses, poses, joints=[1, 1, 1])

@@ -8,7 +8,13 @@ import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_finite, check_shape
+from torchpose._core.checks import (
+    check_choice,
+    check_finite,
+    check_real,
+    check_shape,
+    check_tensors,
+)
 from torchpose._core.rows import joined
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
@@ -107,11 +113,16 @@ def make_transition(
         `Transition` with F [K, D, D], b [K, D] and N [K, D, D], symmetric.
 
     Raises:
-        InputError: unknown kind, or gamma missing or outside [0, 1). ShapeError: variances in place of Q.
+        InputError: unknown kind, gamma missing or outside [0, 1), or an option that the kind does not use.
+        ShapeError: variances in place of Q, or another number of gammas than of components.
     """
+    check_transition_options(kind, gamma, subspace, 0, None)
+    check_tensors(means=means, covariances=covariances)
+    check_shape("means", means, ["K", "D"])
+    check_shape("covariances", covariances, [*means.shape, means.shape[-1]])
     if kind == "ou":
         return _scalar_rate(means, covariances, gamma, subspace)
-    check_choice("transition", kind, TRANSITIONS)
+    check_tensors(process_cov=process_cov)
     check_shape("process_cov", process_cov, list(covariances.shape[-2:]))
     factor = safe_cholesky(covariances + process_cov)
     matrix = torch.cholesky_solve(covariances, factor).mT
@@ -132,12 +143,15 @@ def _scalar_rate(
             "transition 'ou' needs gamma, [K] or a number in [0, 1), got None; "
             "fit it with torchpose.filters.fit_gamma or pass for instance 0.95"
         )
+    check_real("gamma", gamma)
     gamma = torch.as_tensor(gamma).to(means)
+    if gamma.numel() != 1:
+        check_shape("gamma", gamma, [len(means)])
     with torch.no_grad():
         outside = (gamma < 0) | (gamma >= 1) | ~torch.isfinite(gamma)
         if values_visible() and bool(outside.any()):
             raise InputError(f"gamma must lie in [0, 1), got {gamma.tolist()}")
-    rate = gamma.expand(means.shape[0])[:, None, None]
+    rate = gamma.reshape(-1).expand(len(means))[:, None, None]
     dim = means.shape[-1]
     eye = torch.eye(dim, dtype=means.dtype, device=means.device)
     if subspace is None:

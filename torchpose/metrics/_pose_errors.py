@@ -78,16 +78,16 @@ def align(
         `Alignment`; NaN for a frame in which fewer than three of `joints` are there.
 
     Raises:
-        InputError: fewer than three indices, or one that no joint has. ShapeError: other sizes.
+        InputError: fewer than three different indices, or one that no joint has. ShapeError: other sizes.
 
     Reference: Burke & Lasenby, section 6 ("aligning the head, neck and shoulders using fixed scale
     Procrustes analysis").
     """
     estimate, truth = as_pair(estimate, truth, mask, ["...", None, 3])
     chosen = list(range(estimate.shape[-2])) if joints is None else list(joints)
-    if len(chosen) < 3 or not all(0 <= j < estimate.shape[-2] for j in chosen):
+    if len(set(chosen)) < 3 or not all(0 <= j < estimate.shape[-2] for j in chosen):
         raise InputError(
-            f"joints must be three or more indices below {estimate.shape[-2]}, got {chosen}"
+            f"joints must be three or more different indices below {estimate.shape[-2]}, got {chosen}"
         )
     part = None if mask is None else mask[..., chosen]
     motion = procrustes(estimate[..., chosen, :], truth[..., chosen, :], part)
@@ -281,8 +281,9 @@ def limb_hits(
     """Return which limbs are correct at which threshold, and which have a known truth; see `pcp`."""
     estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
     thresholds = as_values("thresholds", thresholds, ["P"])
-    ends = torch.tensor(limbs, device=estimate.device).reshape(-1, 2)
-    if not len(ends) or not bool(((ends >= 0) & (ends < estimate.shape[-2])).all()):
+    ends = torch.as_tensor(limbs, device=estimate.device)
+    pairs = ends.numel() > 0 and ends.shape[1:] == (2,) and not ends.is_floating_point()
+    if not pairs or not bool(((ends >= 0) & (ends < estimate.shape[-2])).all()):
         raise InputError(
             f"limbs must be pairs of joints below {estimate.shape[-2]}, got {ends.tolist()!s:.120}"
         )
