@@ -24,6 +24,7 @@ from torchpose.whole_body import (
     default_step_std,
     fit_sharpness,
     motion_std,
+    reweight,
     track_body,
 )
 from torchpose.whole_body._filters.annealed import anneal
@@ -679,3 +680,25 @@ def test_inputs_that_are_refused():
     with pytest.raises(ShapeError, match="one frame for each"):
         tracker.step(tracker.init(torch.zeros(2, 3)), masks, None)
     assert BodyFilterOutput._fields[:2] == ("mean", "log_evidence")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_evidence_of_particles_that_all_died_is_minus_infinity(dtype):
+    alive = torch.zeros(3, 4, dtype=dtype)
+    likelihood = torch.tensor([0.0, -math.inf, math.nan]).to(dtype)[:, None].expand(3, 4)
+    evidence = reweight(torch.zeros(3, 4, 2, dtype=dtype), alive, likelihood).log_evidence
+    assert evidence.tolist() == [0.0, -math.inf, -math.inf]
+
+
+def test_whole_numbers_may_be_observed_in_sequences_of_different_lengths():
+    seen = torch.tensor([[[1, 0], [2, 1], [0, 0]], [[0, 1], [1, 1], [2, 2]]])
+
+    def likelihood(states, observed):
+        return -(states - observed[:, None]).square().sum(-1)
+
+    tracker = SIRParticleFilter(LinearBody(2), 30, process_cov=0.5, likelihood=likelihood)
+    start, lengths = torch.zeros(2, 2, dtype=torch.float64), torch.tensor([2, 3])
+    both = tracker(seen, None, start, generator=generators(2), lengths=lengths)
+    alone = tracker(seen[:1, :2], None, start[:1], generator=generators(1))
+    torch.testing.assert_close(both.mean[:1, :2], alone.mean, rtol=0, atol=0)
+    torch.testing.assert_close(both.mean[0, 2], both.mean[0, 1], rtol=0, atol=0)

@@ -165,7 +165,12 @@ def is_seen(observed: Tensor) -> Bool[Tensor, " B"]:
 
 
 def seen_until(inside: Bool[Tensor, " B"], observed: Tensor) -> Tensor:
-    """Return the observations [B, ...] with nothing seen in the sequences that are over."""
+    """Return the observations [B, ...] with nothing seen in the sequences that are over.
+
+    Whole numbers, which a callable may take, have no value for that, and stay.
+    """
+    if observed.dtype != torch.bool and not observed.is_floating_point():
+        return observed
     over = ~inside.to(observed.device).view(-1, *[1] * (observed.ndim - 1))
     return observed.masked_fill(over, False if observed.dtype == torch.bool else torch.nan)
 

@@ -232,7 +232,8 @@ def reweight(
     joint = log_prior + log_likelihood
     evidence = torch.logsumexp(joint, -1)
     log_weights = joint - evidence[:, None]
-    return WeightedParticles(particles, log_weights, evidence.nan_to_num(-torch.inf))
+    evidence = torch.where(evidence.isnan(), -torch.inf, evidence)
+    return WeightedParticles(particles, log_weights, evidence)
 
 
 def take_particles(
