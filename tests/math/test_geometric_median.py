@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.priors.mixtures import random_mixture
+from torchpose import without_value_checks
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.math._geometric_median import geometric_median
 
@@ -70,3 +71,17 @@ def test_a_frame_by_itself_gives_the_same(frames):
     for t in range(frames):
         state, step = model.step(state, z[:, t], return_cov=True)
         torch.testing.assert_close(step.mean, out.mean[:, t])
+
+
+def test_derivatives_are_the_same_in_every_way_to_take_them():
+    weights, means, spread = problem(n=2)
+    start = (weights[..., None, None] * means).sum(1)
+
+    def found(means):
+        return geometric_median(weights, means, spread, start)
+
+    rows = torch.autograd.functional.jacobian(found, means)
+    torch.testing.assert_close(torch.func.jacrev(found)(means), rows, rtol=1e-12, atol=1e-12)
+    with without_value_checks():
+        torch.testing.assert_close(torch.func.jacfwd(found)(means), rows, rtol=1e-12, atol=1e-12)
+    assert torch.autograd.gradgradcheck(found, means.requires_grad_())

@@ -5,6 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose._core.value_checks import values_visible
+
 _STEPS = 5
 _LEAST = 1e-18  # of a spread, where a mean that has none is hit
 
@@ -36,9 +38,18 @@ def geometric_median(
     shares = weights[..., None, :].expand(offsets.shape[:-1]).flatten(0, -2)[:, None]
     x = torch.zeros_like(flat[:, :1])
     for _ in range(_STEPS):
-        pull = shares / torch.cdist(x, points, compute_mode="donot_use_mm_for_euclid_dist")
+        pull = shares / _distances(x, points)
         x = torch.bmm(pull, flat) / pull.sum(-1, keepdim=True)
     return start + x[..., :3].view(start.shape)
+
+
+def _distances(x: Float[Tensor, "N 1 4"], points: Float[Tensor, "N M 4"]) -> Float[Tensor, "N 1 M"]:
+    """Return the distances of points from x."""
+    learning = torch.is_grad_enabled() and (x.requires_grad or points.requires_grad)
+    if learning or not values_visible():
+        # the gradient of cdist is wrong under torch.func.jacrev and has none of its own
+        return torch.linalg.vector_norm(points - x, dim=-1)[:, None]
+    return torch.cdist(x, points, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def median_columns(points: Int[Tensor, " P"]) -> Int[Tensor, "P 3"]:
