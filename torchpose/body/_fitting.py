@@ -33,9 +33,7 @@ _TORSO_TILT = 1e-2  # square metres, weight of the torso's tilt where the hips d
 _LEAST_TILT = 1e-9  # and where they do
 _DAMPING = 1e-6  # square metres, of Gauss-Newton: keeps the twist where it is, at least
 _MOST_DAMPING = 1e3  # frames that no step makes better stay where they are
-_MOST_SCALE = (
-    3.0  # of somebody's bones beside those of the body: more are other units, feet included
-)
+_MOST_SCALE = 3.0  # of bones beside those of the body; beyond, units differ, feet included
 _ROUNDS = 4  # of rigid shapes and rotations in turn; the change is below 0.1 mm after three
 _CHUNK = 2048  # frames per Gauss-Newton step, 30 MB of Jacobians
 

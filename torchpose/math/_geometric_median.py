@@ -47,7 +47,7 @@ def _distances(x: Float[Tensor, "N 1 4"], points: Float[Tensor, "N M 4"]) -> Flo
     """Return the distances of points from x."""
     learning = torch.is_grad_enabled() and (x.requires_grad or points.requires_grad)
     if learning or not values_visible():
-        # the gradient of cdist is wrong under torch.func.jacrev and has none of its own
+        # the backward pass of cdist is wrong where torch.func.jacrev batches it, and has no derivative
         return torch.linalg.vector_norm(points - x, dim=-1)[:, None]
     return torch.cdist(x, points, compute_mode="donot_use_mm_for_euclid_dist")
 

@@ -160,8 +160,8 @@ def unscented_update(
     """
     check_tensors(mean=mean, covariance=covariance, measured=measured, noise=noise)
     points = sigma_points(mean, covariance, centre=centre, directions=directions)
-    dim, count = points.shape[-1], (measured.shape or (1,))[-1]
     check_shape("measured", measured, ["...", "Z"])
+    dim, count = points.shape[-1], measured.shape[-1]
     check_shape("noise", noise, ["...", count, count])
     seen = function(points)
     check_tensors(**{"what function returns": seen})
