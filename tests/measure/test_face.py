@@ -9,10 +9,11 @@ import torch
 
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import HaarFaceDetector
+from torchpose.measure import HaarFaceDetector, UpperBodyMeasurer
 from torchpose.measure._face import FaceTracker
 from torchpose.measure._face_detector import Region
 from torchpose.measure._grey_frame import GreyFrame
+from torchpose.priors import load_prior
 
 
 def nobody(image, region=None):
@@ -90,6 +91,35 @@ def test_two_faces_that_pass_keep_their_identities():
     _, states, _ = follow(frames, every=1, whole_every=1)
     final = dict(zip(states[-1].identity.tolist(), states[-1].mean[:, 0].tolist(), strict=True))
     assert final == pytest.approx({0: 480.0, 1: 120.0}, abs=12)
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0, 6.0])
+def test_faces_that_move_as_fast_are_followed_in_slower_videos(rate):
+    step = 16 * rate  # pixels a frame, at 30 frames a second a fifth of the face
+    frames = [[[80.0 + step * t, y, 80] for y in (150.0, 254.0)] for t in range(int(60 / rate))]
+    frames = [faces for faces in frames if faces[0][0] < 560]
+    _, states, _ = follow(frames, rate=rate)
+    assert states[-1].identity.tolist() == [0, 1]
+    assert states[-1].hits.tolist() == pytest.approx(
+        2 * [min(len(frames), 30)], abs=len(frames) / 2
+    )
+    away = states[-1].mean[:, :2] - torch.tensor(frames[-1]).double()[:, :2]
+    assert float(away.abs().max()) < 8
+
+
+def test_frames_of_a_slow_video_are_searched_as_often_as_time_allows():
+    face = [[300.0, 200.0, 90.0]]
+    asked = []
+    for rate in (1.0, 2.0):
+        _, _, detector = follow([face] * int(60 / rate), every=2, whole_every=10, rate=rate)
+        asked.append(sum(region is None for region in detector.asked))
+    assert asked == [6, pytest.approx(6, abs=1)]
+
+
+@pytest.mark.parametrize(("fps", "rate"), [(10, 3.0), (25, 1.2), (30, 1.0), (60, 1.0)])
+def test_a_measurer_follows_faces_at_the_rate_of_its_video(fps, rate):
+    measurer = UpperBodyMeasurer(load_prior("kinect-upper-body-small"), fps, hands="mean-shift")
+    assert measurer.face_tracker.rate == pytest.approx(rate)
 
 
 def test_known_faces_are_searched_where_they_are():

@@ -69,6 +69,10 @@ class FaceTracker(nn.Module):
     deviations below are in sizes of the face. A track ends as well when its predicted size falls below 4
     pixels, as that of a face does which is lost while it moves away.
 
+    Numbers of frames, `gate`, `acceleration` and `damping` are given for 30 frames per second. At another
+    rate as much time passes from search to search; where frames are farther apart than that, each is
+    searched, in more of the image, and faces may have moved farther.
+
     Args:
         detector: by default `HaarFaceDetector`; see `torchpose.measure.FaceDetector`.
         every: search for known faces in every n-th frame, in the region about them; while no track is
@@ -84,6 +88,7 @@ class FaceTracker(nn.Module):
             larger boxes about small faces, and large faces cost time.
         smallest: size, in pixels, of faces that are searched for where none above 40 is found; reliably
             found are those that are half as large again. 40 turns that off.
+        rate: frames at 30 per second that pass in one step.
 
     Raises:
         InputError: settings out of range, or a detector that cannot be called.
@@ -114,6 +119,7 @@ class FaceTracker(nn.Module):
         damping: float = 0.9,
         detail: float = 80.0,
         smallest: float = 11.0,
+        rate: float = 1.0,
     ) -> None:
         super().__init__()
         if min(every, whole_every, search_every, min_hits, memory) < 1 or memory < min_hits:
@@ -121,10 +127,10 @@ class FaceTracker(nn.Module):
                 "every, whole_every, search_every, min_hits and memory must be at least 1, and memory "
                 f"at least min_hits, got {every}, {whole_every}, {search_every}, {min_hits}, {memory}"
             )
-        if not (min(gate, std, acceleration, detail, smallest) > 0 and 0 <= damping <= 1):
+        if not (min(gate, std, acceleration, detail, smallest, rate) > 0 and 0 <= damping <= 1):
             raise InputError(
-                "gate, std, acceleration, detail and smallest must be positive and damping in [0, 1], "
-                f"got {gate}, {std}, {acceleration}, {detail}, {smallest} and {damping}"
+                "gate, std, acceleration, detail, smallest and rate must be positive and damping in [0, 1], "
+                f"got {gate}, {std}, {acceleration}, {detail}, {smallest}, {rate} and {damping}"
             )
         self.detector = HaarFaceDetector() if detector is None else detector
         if not callable(self.detector):
@@ -132,11 +138,17 @@ class FaceTracker(nn.Module):
                 "a face detector must be callable, as torchpose.measure.FaceDetector, got "
                 f"{type(detector).__name__}"
             )
-        self.every, self.whole_every, self.search_every = every, whole_every, search_every
+        self.every, self.whole_every, self.search_every = (
+            max(1, round(frames / rate)) for frames in (every, whole_every, search_every)
+        )
+        self.farther = max(
+            1.0, self.every * rate / every
+        )  # times as far faces move between searches
         self.gate, self.min_hits, self.memory = gate, min_hits, memory
-        self.std, self.acceleration = std, acceleration
+        self.std, self.rate = std, rate
+        self.acceleration = acceleration * rate**1.5  # a random walk of velocities per frame
         self.detail, self.smallest = detail, smallest
-        motion = torch.tensor([[1.0, 1.0], [0.0, damping]], dtype=torch.float64)
+        motion = torch.tensor([[1.0, 1.0], [0.0, damping**rate]], dtype=torch.float64)
         self.register_buffer("matrix", torch.kron(motion, torch.eye(3, dtype=torch.float64)))
         self.register_buffer("observed", torch.arange(3))
 
@@ -253,7 +265,8 @@ class FaceTracker(nn.Module):
         Args:
             reach: see `_CLOSE`. turns: degrees by which the image is turned while nothing is found.
         """
-        region = _region(face, image.shape, *reach)
+        half, smaller, larger = reach
+        region = _region(face, image.shape, self.farther * half, smaller, larger)
         image = _seen_in(image, region)
         part = image[region.top : region.bottom, region.left : region.right]
         scale = self.detail / max(face[2], 1.0)
@@ -289,7 +302,7 @@ class FaceTracker(nn.Module):
         check_shape("found", found, ["n", 3])
         check_finite("found", found)
         found = found.to(self.matrix)
-        owner = _nearest(tracks.mean[:, :3], found, self.gate)
+        owner = _nearest(tracks.mean[:, :3], found, self.farther * self.gate)
         seen = torch.zeros(len(tracks.mean), dtype=torch.bool)
         seen[owner[owner >= 0]] = True
         z = tracks.mean[:, :3].clone()
@@ -312,7 +325,7 @@ class FaceTracker(nn.Module):
     def _new_tracks(self, found: Tensor, first: int) -> tuple[Tensor, ...]:
         n = len(found)
         size = found[:, 2]
-        spread = self.std * found.new_tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+        spread = self.std * found.new_tensor([1.0] * 3 + [2.0 * self.rate] * 3)
         cov = torch.diag_embed((spread * size[:, None]).square())
         count = torch.zeros(n, dtype=torch.long)
         mean = torch.cat([found, torch.zeros_like(found)], 1)

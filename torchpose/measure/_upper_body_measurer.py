@@ -173,7 +173,8 @@ class UpperBodyMeasurer(CpuModule):
         self.learnt = hands == "learnt"
         measured = self.learnt if elbows is None else elbows
         self.names = MEASURED + _ELBOWS if measured else MEASURED
-        self.face_tracker = FaceTracker(face_detector)
+        # faster videos are searched as often as those of 30, for heads that move fast
+        self.face_tracker = FaceTracker(face_detector, rate=max(1.0, 30.0 / fps))
         offsets = FACE_OFFSETS if self.learnt and measured else WITHOUT_ELBOWS
         self.head_neck = HeadNeck(offsets) if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * fps))
