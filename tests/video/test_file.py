@@ -142,9 +142,19 @@ def test_a_picture_with_the_name_of_a_video(tmp_path, suffix):
             open_video(tmp_path / name)
 
 
+def test_a_photograph_is_a_single_picture(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "a.jpg"), noise)
+    with pytest.raises(FileFormatError, match=r"single picture \(jpg\); .*give the folder"):
+        open_video(tmp_path / "a.jpg")
+
+
 def test_nothing_there_and_a_folder(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         open_video(tmp_path / "missing.mp4")
+    for address in ("https://example.org/a.mp4", "rtsp://camera/1"):
+        with pytest.raises(InputError, match="addresses are not read: copy the video"):
+            open_video(address)
     with pytest.raises(InputError, match="is a folder"):
         FileSource(tmp_path)
     with pytest.raises(InputError, match="none among its 0 files"):

@@ -10,6 +10,7 @@ from torchpose.video._images import FolderSource
 from torchpose.video._source_interface import VideoSource
 
 _KINDS = ("file", "folder", "camera")
+_ADDRESS = "://"
 
 
 def open_video(
@@ -28,7 +29,7 @@ def open_video(
         Frames and what is known about them; close it, or use it in a `with` statement.
 
     Raises:
-        InputError: nothing there, an unknown kind, or a rate that is not positive.
+        InputError: nothing there, an address, an unknown kind, or a rate that is not positive.
         FileFormatError: not a video, or one without a single frame that can be decoded.
 
     Example:
@@ -55,7 +56,10 @@ def open_video(
     if kind == "folder" or (kind is None and os.path.isdir(path)):
         return FolderSource(path, fps)
     if not os.path.exists(path):
-        raise InputError(f"{text}: no such file or folder; a camera is given by its number")
+        what = "addresses are not read: copy the video, and give the path of the copy"
+        if _ADDRESS not in text:
+            what = "no such file or folder; a camera is given by its number"
+        raise InputError(f"{text}: {what}")
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{text}: is a device or a pipe; a camera is given by its number")
     return FileSource(path, fps)

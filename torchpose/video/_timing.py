@@ -181,7 +181,8 @@ def _count(tally: Tally, shown: int) -> None:
 
 
 _SCAN_PACKETS, _SCAN_BYTES = 20_000, 500_000_000  # what is read ahead to learn rate and length
-_NO_VIDEO = {"tty", "image2", "hls", "concat", "dash", "sdp", "rtsp", "lavfi"}
+_PICTURE = "image2"  # for which FFmpeg takes some JPEGs, by their names
+_NO_VIDEO = {"tty", "hls", "concat", "dash", "sdp", "rtsp", "lavfi"}
 
 
 class Scan(NamedTuple):
@@ -221,8 +222,8 @@ def open_container(path: Path) -> tuple["av.container.InputContainer", "av.Video
         raise FileFormatError(f"{path}: {_why_not(path, error)}") from error
     try:
         name = container.format.name
-        if name.endswith("_pipe"):
-            kind = name.removesuffix("_pipe")
+        if name.endswith("_pipe") or name == _PICTURE:
+            kind = path.suffix[1:].lower() if name == _PICTURE else name.removesuffix("_pipe")
             raise FileFormatError(
                 f"{path}: expected a video, got a single picture ({kind}); "
                 "pictures are read from a folder: give the folder"
