@@ -98,6 +98,22 @@ def test_a_folder_of_images_at_another_rate(clip, track, tmp_path):
     assert PoseTrack.load(out / "poses.npz").fps == 25.0
 
 
+def test_a_folder_of_images_with_labels_is_video_and_no_place_for_results(torchpose, tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(frames / f"f{number}.png"), np.zeros((48, 64, 3), np.uint8))
+    (frames / "labels.json").write_text("{}")
+    done = torchpose("track", frames, "--out", tmp_path / "out", "--overlay", "false")
+    assert done.code == 1 and "3 frames" in done.err, done.err
+    done = torchpose("track", frames, "--out", frames)
+    assert done.code == 2 and "is the folder of the images" in done.err, done.err
+    assert "choose another folder, such as" in done.err and len(list(frames.iterdir())) == 4
+    (frames / "f0_keypoints.json").write_text(json.dumps({"people": []}))
+    done = torchpose("track", frames, "--out", tmp_path / "out")
+    assert done.code == 2 and "nobody was found in any of 1 frame" in done.err, done.err
+
+
 def test_a_video_without_a_face_has_no_poses(track, tmp_path):
     grey = tmp_path / "grey.mp4"
     with VideoWriter(grey, 30.0, (160, 120)) as writer:

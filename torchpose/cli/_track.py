@@ -179,11 +179,20 @@ def is_video(where: str) -> bool:
     """Return whether it is a video, a folder of images or a camera, and not keypoints.
 
     Tables that other programs write count as keypoints: FFmpeg takes some for video, as DeepLabCut's .h5.
+    A folder of images may hold other JSON files than those of keypoints, such as labels.
     """
     path = Path(where)
     if path.is_dir():
-        return not any(path.glob("*.json"))
+        return _holds_images(path) or not any(path.glob("*.json"))
     return path.suffix.lower() not in (*_KEYPOINT_FILES, *OTHER_TABLES)
+
+
+def _holds_images(folder: Path) -> bool:
+    """Return whether a folder holds images, and no files of keypoints, beside which they may be drawn."""
+    from torchpose.io._formats.openpose import openpose_files
+    from torchpose.video._images import is_image
+
+    return not openpose_files(folder) and any(map(is_image, folder.glob("*")))
 
 
 def parse_stds(value: Any) -> float | list[float] | None:

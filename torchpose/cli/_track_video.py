@@ -74,6 +74,7 @@ def track_video(
 
     settings, detector = job.settings, options["detector"]
     _refuse_options(job, detector, face_model)
+    _refuse_own_folder(job)
     share_cores()
     prior = load_prior(settings.prior)
     pictures = pictures_possible(job.pictures)
@@ -197,6 +198,16 @@ def _refuse_options(job: TrackingJob, detector: str | None, face_model: str | No
     if detector is not None and face_model is not None:
         raise InputError(
             "--face-model is for faces, whose place --detector takes; give one of them"
+        )
+
+
+def _refuse_own_folder(job: TrackingJob) -> None:
+    """Raise `InputError` for results among the images, of which their pictures would be the next ones."""
+    images, out = Path(job.input), Path(job.out)
+    if images.is_dir() and out.is_dir() and images.samefile(out):
+        raise InputError(
+            f"--out {job.out} is the folder of the images, and pictures of the results would be taken for "
+            f"images of the next run; choose another folder, such as {out / 'result'}"
         )
 
 

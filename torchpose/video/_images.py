@@ -28,6 +28,11 @@ def natural_key(name: str) -> list[str | int]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
+def is_image(path: Path) -> bool:
+    """Return whether a file has the name of an image."""
+    return path.suffix.lower() in _SUFFIXES
+
+
 def find_images(folder: str | Path) -> list[Path]:
     """Return images directly in a folder (png, jpg, bmp, tif, webp), in natural order of their names.
 
@@ -41,7 +46,7 @@ def find_images(folder: str | Path) -> list[Path]:
         files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror or error})") from error
-    images = [path for path in files if path.suffix.lower() in _SUFFIXES]
+    images = [path for path in files if is_image(path)]
     if not images:
         raise InputError(
             f"{folder}: expected a folder of images (png, jpg, bmp, tif, webp), found none among "
