@@ -5,6 +5,7 @@ import math
 import sys
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -326,6 +327,28 @@ def test_no_smoothing_and_no_bound_may_be_numbers(prior):
     tracker = VideoTracker(prior, demo_camera(), smoothing=0, max_gap=math.inf)
     assert tracker.smoother is None and tracker.gap == sys.maxsize
     assert tracker.step(tracker.init(), np.zeros((480, 640, 3), np.uint8))[1] == []
+
+
+@pytest.mark.parametrize("frames", ["clip.mp4", Path("clip.mp4"), None, 0])
+def test_what_is_no_video_is_told_how_to_open_one(prior, frames):
+    tracker = VideoTracker(prior, demo_camera())
+    name = type(frames).__name__
+    with pytest.raises(InputError, match=rf"frames must be .*, got {name}; .*open_video\(path\)"):
+        tracker(frames)
+    with pytest.raises(InputError, match="frames must be RGB images"):
+        tracker.advance(tracker.init(), frames)
+
+
+@pytest.mark.parametrize("fps", ["30", None, math.inf, math.nan, 0.01])
+def test_rates_that_no_video_has_are_refused(prior, fps):
+    with pytest.raises(InputError, match="fps must be"):
+        VideoTracker(prior, demo_camera(), fps=fps)
+
+
+@pytest.mark.parametrize("switch", ["background", "elbows", "edges", "candidates"])
+def test_switches_are_no_texts(prior, switch):
+    with pytest.raises(InputError, match=f"{switch} must be True or False, got 'no'"):
+        VideoTracker(prior, demo_camera(), **{switch: "no"})
 
 
 def test_bad_use_is_refused(prior):

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_choice, check_count, check_rgb
+from torchpose._core.checks import check_choice, check_count, check_rate, check_rgb
 from torchpose._core.images import Image
 from torchpose._core.module_state import CpuModule, as_one_run
 from torchpose.errors import InputError
@@ -167,22 +167,20 @@ class UpperBodyMeasurer(CpuModule):
         check_choice("hands", hands, HAND_TRACKERS)
         if max_persons is not None:
             check_count("max_persons", max_persons)
-        if not fps > 0:
-            raise InputError(f"fps must be positive, got {fps}")
-        self.fps, self.max_persons = float(fps), max_persons
+        self.fps, self.max_persons = check_rate("fps", fps), max_persons
         self.learnt = hands == "learnt"
         measured = self.learnt if elbows is None else elbows
         self.names = MEASURED + _ELBOWS if measured else MEASURED
         # faster videos are searched as often as those of 30, for heads that move fast
-        self.face_tracker = FaceTracker(face_detector, rate=max(1.0, 30.0 / fps))
+        self.face_tracker = FaceTracker(face_detector, rate=max(1.0, 30.0 / self.fps))
         offsets = FACE_OFFSETS if self.learnt and measured else WITHOUT_ELBOWS
         self.head_neck = HeadNeck(offsets) if head_neck is None else head_neck
-        self.register = PersonRegister(within=round(30 * fps))
-        self.scene_cuts = SceneCuts(fps)
+        self.register = PersonRegister(within=round(30 * self.fps))
+        self.scene_cuts = SceneCuts(self.fps)
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":
             network = shipped_hand_network() if self.learnt else None
-            self.hand_tracker = HandTracker(prior, fps=fps, network=network, elbows=measured)
+            self.hand_tracker = HandTracker(prior, fps=self.fps, network=network, elbows=measured)
         else:
             self.hand_tracker = MeanShiftHandTracker()
         self.background = BackgroundModel() if background else None

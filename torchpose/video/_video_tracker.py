@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from numbers import Integral
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_rgb, number_of
+from torchpose._core.checks import check_rgb, check_tracked_rate, number_of
 from torchpose._core.images import Image
 from torchpose._core.module_state import derived
 from torchpose._core.uncompiled import uncompiled
@@ -196,6 +197,16 @@ class VideoTracker(nn.Module):
         for name, value in (("max_persons", max_persons), ("seed", seed)):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
                 raise InputError(f"{name} must be a whole number, got {value!r}")
+        switches = {
+            "background": background,
+            "elbows": elbows,
+            "edges": edges,
+            "candidates": candidates,
+        }
+        for name, value in switches.items():
+            if value is not None and value not in (True, False):
+                raise InputError(f"{name} must be True or False, got {value!r}")
+        check_tracked_rate(fps)
         if max_gap is not None and not number_of(max_gap) > 0:
             raise InputError(
                 f"max_gap must be positive, seconds, or None for never, got {max_gap!r}"
@@ -355,8 +366,8 @@ class VideoTracker(nn.Module):
             The persons who were seen for half a second or longer, the longest seen first.
 
         Raises:
-            InputError: an image of another kind or another size than the camera's, or a video with another
-                rate than `fps`. OutputError: the disk is full.
+            InputError: no images, one of another kind or another size than the camera's, or a video with
+                another rate than `fps`. OutputError: the disk is full.
         """
         recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
         record(self, recording, frames, progress, n_frames, watch, workers)
@@ -378,6 +389,7 @@ class VideoTracker(nn.Module):
         Args:
             frames: see `forward`. size: (width, height) of the frames before, None if there are none.
         """
+        _check_frames(frames)
         rate = getattr(frames, "fps", None) if getattr(frames, "knows_rate", True) else None
         if rate and abs(rate / self.fps - 1) > _SAME_RATE:
             raise InputError(
@@ -514,6 +526,16 @@ def _refuse_measurer(**given: bool) -> None:
             raise InputError(
                 f"{option} is of the measurer of faces and hands, whose place a detector takes; leave it out"
             )
+
+
+def _check_frames(frames: Any) -> None:
+    """Raise `InputError` for what are no frames, such as the path of a video."""
+    several = hasattr(frames, "__iter__") or hasattr(frames, "__getitem__")
+    if isinstance(frames, str | bytes | PathLike) or not several:
+        raise InputError(
+            "frames must be RGB images of uint8: a tensor [T, 3, H, W], an array [T, H, W, 3], or what yields"
+            f" them, got {type(frames).__name__}; torchpose.video.open_video(path) opens a file or a folder"
+        )
 
 
 def as_image(image: Any) -> Image:
