@@ -14,7 +14,7 @@ from tests.cli.pretended_camera import PretendedCamera, use_camera
 from torchpose import demo
 from torchpose.cli._common import UntilInterrupted
 from torchpose.cli._track_output import notes_of_all
-from torchpose.cli._track_video import _stopping
+from torchpose.cli._track_video import _note_on_colours, _stopping
 from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
@@ -148,6 +148,19 @@ def test_a_video_on_its_side_is_said_to_be(clip, track, tmp_path, turns):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("first", "light", "said"), [(0, 0.8, True), (1, 0.8, False), (2, 0.8, True), (0, 0.1, False)]
+)
+def test_a_video_without_colours_is_said_to_be(tmp_path, first, light, said):
+    skin = np.full((48, 64, 3), (120, 150, 200), np.uint8)
+    for number in range(3):  # the second one is in colour
+        image = skin if number == 1 else np.repeat(skin[..., 1:2], 3, 2)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), (light * image).astype(np.uint8))
+    with open_video(tmp_path) as source:
+        notes = _note_on_colours(source, first)
+    assert ["no colours" in note for note in notes] == [True] * said
+
+
 def test_several_persons_and_then_one(clip, track, tmp_path):
     path, _ = clip
     wide = tmp_path / "wide.mp4"

@@ -1,6 +1,7 @@
 """`torchpose track` on video: a file, a folder of images, or a camera."""
 
 import contextlib
+import itertools
 import signal
 import sys
 import time
@@ -42,6 +43,11 @@ if TYPE_CHECKING:
     from torchpose.video._writer import VideoWriter
 
 _OVERLAY = "overlay.mp4"
+_GREY, _DARK = (
+    8,
+    50,
+)  # range of R, G and B up to which a pixel is grey, and brightness that shows it
+_LATEST = 300  # frames that are passed over at most for one with a person
 _THROUGHOUT = 0.9  # share of the frames in which a face is seen that nobody doubts
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
 
@@ -102,6 +108,8 @@ def track_video(
             raise failure
         if not people:
             return _nobody(job.input, n_frames, source.fps, notes, results.folder, detector)
+        if source.reopenable and detector is None:
+            notes += _note_on_colours(source, people[0].first_frame)
         notes += _note_on_facts(settings, len(people))
         rate = n_read / max(seconds, 1e-9)
         facts = _facts(job, options, source, prior, camera, people[0].track.method, rate)
@@ -134,6 +142,21 @@ def _note_on_turn(
         return ()
     return (
         f"faces are upright if the video is turned by {turn} degrees clockwise: turn it, and track it again",
+    )
+
+
+def _note_on_colours(source: "VideoSource", first_frame: int) -> tuple[str, ...]:
+    """Return a note if a video is grey, by the frame in which a person is first seen, or one before."""
+    import numpy as np
+
+    with source.reopen() as again:
+        image = next(itertools.islice(again, min(first_frame, _LATEST), None)).image[::4, ::4]
+    colour = np.quantile(image.max(-1) - image.min(-1), 0.99)
+    if colour > _GREY or image.max() < _DARK:
+        return ()
+    return (
+        "the video has no colours, by which skin is told from clothes: hands and elbows are found in wrong "
+        "places more often",
     )
 
 
