@@ -122,6 +122,25 @@ def test_a_measurer_follows_faces_at_the_rate_of_its_video(fps, rate):
     assert measurer.face_tracker.rate == pytest.approx(rate)
 
 
+@pytest.mark.parametrize("n_black", [0, 1, 3])
+def test_a_face_after_black_frames_is_used_from_the_third_on(n_black):
+    def bright(image, region=None):
+        return torch.tensor([[160.0, 60.0, 80.0]] * bool(image[60, 160])).double().reshape(-1, 3)
+
+    prior = load_prior("kinect-upper-body-small")
+    measurer = UpperBodyMeasurer(prior, hands="mean-shift", face_detector=bright)
+    scene = (
+        np.random.default_rng(0).integers(1, 255, (12, 16, 3), np.uint8).repeat(20, 0).repeat(20, 1)
+    )
+    images = [scene] * 8 + [np.zeros_like(scene)] * n_black + [scene] * 4
+    state, found = measurer.init(), []
+    for image in images:
+        state, measured = measurer.step(state, image)
+        found.append(len(measured.person))
+    after = [0, 0, 1, 1] if n_black else [1] * 4
+    assert found == [0, 0, *[1] * 6, *[0] * n_black, *after]
+
+
 def test_known_faces_are_searched_where_they_are():
     face = [[300.0, 200.0, 90.0]]
     _, _, detector = follow([face] * 12, every=2, whole_every=10)

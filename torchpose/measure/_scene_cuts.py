@@ -32,6 +32,11 @@ class SceneState(NamedTuple):
     usual: float
     cut: float = 0.0
 
+    @property
+    def blank(self) -> bool:
+        """Return whether the last frame showed nothing, as black ones do."""
+        return self.pattern is not None and _is_blank(self.pattern)
+
 
 class SceneCuts:
     """Tells in which frames another scene begins.

@@ -218,6 +218,7 @@ class UpperBodyMeasurer(CpuModule):
         scene, cut = self.scene_cuts.step(seen.scene, image)
         if cut:  # without faces, hands are forgotten as well
             self._forget_background()
+        if cut or seen.scene.blank:  # the first frame that shows something is searched at once
             seen = seen._replace(faces=self.face_tracker.begin_anew(seen.faces))
         tracks = self._follow_faces(seen.faces, image)
         faces, face_cov, identity, detected = self._used(tracks, seen.persons, image)
