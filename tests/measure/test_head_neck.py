@@ -1,5 +1,6 @@
 """Head and neck beside the face."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -52,3 +53,14 @@ def test_neck_is_farther_down_where_no_network_measures_elbows(options, neck):
 def test_bad_offsets_are_refused():
     with pytest.raises(InputError, match="positive"):
         HeadNeck(FACE_OFFSETS._replace(head_std=(0.0, 0.1)))
+
+
+def test_bad_use_of_a_measurer_is_refused():
+    prior = load_prior("kinect-upper-body-small")
+    with pytest.raises(InputError, match="head_neck must be a HeadNeck, got int"):
+        UpperBodyMeasurer(prior, head_neck=3)
+    measurer, image = UpperBodyMeasurer(prior, hands="mean-shift"), np.zeros((48, 64, 3), np.uint8)
+    with pytest.raises(InputError, match=r"a frame must be RGB.*, got \[0, 64, 3\]"):
+        measurer.step(measurer.init(), image[:0])
+    with pytest.raises(InputError, match="state must be a MeasurerState, got NoneType; begin with"):
+        measurer.step(None, image)

@@ -143,7 +143,7 @@ class KeypointMeasurer:
         Raises:
             InputError: another kind of image, or a detector that returns something else than it says.
         """
-        check_rgb("a frame", image)
+        check_rgb("a frame", image, empty=False)
         scene, cut = self.scene_cuts.step(state.scene, image)
         if cut:
             nobody = no_tracks(len(self.names))

@@ -174,6 +174,11 @@ class UpperBodyMeasurer(CpuModule):
         # faster videos are searched as often as those of 30, for heads that move fast
         self.face_tracker = FaceTracker(face_detector, rate=max(1.0, 30.0 / self.fps))
         offsets = FACE_OFFSETS if self.learnt and measured else WITHOUT_ELBOWS
+        if not isinstance(head_neck, HeadNeck | None):
+            raise InputError(
+                f"head_neck must be a HeadNeck, got {type(head_neck).__name__}; its offsets are those of "
+                "head and neck below the face"
+            )
         self.head_neck = HeadNeck(offsets) if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * self.fps))
         self.scene_cuts = SceneCuts(self.fps)
@@ -214,7 +219,7 @@ class UpperBodyMeasurer(CpuModule):
         Raises:
             InputError: another kind of image.
         """
-        check_rgb("a frame", image)
+        check_rgb("a frame", image, empty=False)
         scene, cut = self.scene_cuts.step(seen.scene, image)
         if cut:  # without faces, hands are forgotten as well
             self._forget_background()
@@ -262,8 +267,14 @@ class UpperBodyMeasurer(CpuModule):
             The next state, and `FrameMeasurements` of all persons, pixels.
 
         Raises:
-            InputError: another kind of image; candidates for a tracker that takes none.
+            InputError: what is no state of it, another kind of image, or candidates for a tracker that takes
+            none.
         """
+        if not isinstance(state, MeasurerState):
+            raise InputError(
+                f"state must be a MeasurerState, got {type(state).__name__}; begin with init, and pass on "
+                "what the step before returned"
+            )
         if view is None:
             view = self.look(state.seen, image)
         faces, number = view.faces, view.number
