@@ -393,7 +393,8 @@ class UpperBodyTracker(WideModule):
         """Track one more frame of each stream: the same numbers as that frame of `forward`.
 
         A camera does not stop, so `max_gap` raises nothing here: while nothing is measured the prior
-        fills in, covariances grow, and `LivePose.unseen` says for how long it has been so. Frames
+        fills in, covariances grow, and `LivePose.unseen` says for how long it has been so. Whoever comes
+        back after seconds is followed better from a new state, by `init`. Frames
         that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
         Keypoints of a network are to be detached, or the state holds the graph of all frames before.
 
