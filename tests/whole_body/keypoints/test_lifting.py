@@ -22,6 +22,7 @@ from torchpose.priors._lifting_network import (
     shipped_lifting_network,
 )
 from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._keypoints.adapted_noise import AdaptedNoise
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian
 from torchpose.whole_body._keypoints.body_roll import BodyRoll, next_roll
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
@@ -108,8 +109,9 @@ def state_of(motion):
     cov[scales, scales] *= 1e-6
     new = point.position.new_zeros
     state = BodyGaussian(
-        point, cov[None], new(1, 1, 2), new(1, 1), new(1, 15), new(1, 1), new(1, 15, 3)
-    )
+        point, cov[None], new(1, 1, 2), new(1, 1), new(1, 15), new(1, 1), new(1, 15, 3),
+        AdaptedNoise.usual(new(1, 45)),
+    )  # fmt: skip
     return filter, state
 
 

@@ -11,6 +11,7 @@ from tests.whole_body.keypoints.scenes import ring, scene
 from torchpose.body import BODY_15, Body
 from torchpose.body._articulation import Articulation, BodyPoint
 from torchpose.priors._shipped import load_body_motion
+from torchpose.whole_body._keypoints.adapted_noise import AdaptedNoise
 from torchpose.whole_body._keypoints.body_kalman import BodyGaussian, BodyKalmanFilter
 from torchpose.whole_body._keypoints.body_transition import coasting_transition, transition
 from torchpose.whole_body._keypoints.joint_triangulation import triangulate
@@ -112,7 +113,7 @@ def test_one_iteration_is_the_dense_kalman_update(motion):
     of_cameras = new((1, 3), 1.0)
     state = BodyGaussian(
         point, cov, new((1, 3, 2), -50.0), of_cameras, new((1, 15), -5.0), of_cameras,
-        new((1, 15, 3), torch.nan),
+        new((1, 15, 3), torch.nan), AdaptedNoise.usual(new((1, 45), 0.0)),
     )  # fmt: skip
     frame = frame_of(given)
     found = BodyKalmanFilter(motion, given.rig, 30.0).correct(state, frame, (1.0,))

@@ -29,6 +29,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig
 from torchpose.math._gaussian import point_blocks, symmetrise
 from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.adapted_noise import AdaptedNoise
 from torchpose.whole_body._keypoints.body_transition import (
     BodyTransition,
     coasting_transition,
@@ -91,6 +92,7 @@ class BodyGaussian(NamedTuple):
         doubt: [B, J], log-odds of a joint elsewhere than the prediction has it.
         told: [B, C], number of frames whose mean the scale is, at most; the usual noise counts as some.
         agreed: [B, J, 3], where cameras agreed in the frame on a joint that was not expected there, else NaN.
+        moving: how briskly bodies move.
     """
 
     mean: BodyPoint
@@ -100,6 +102,7 @@ class BodyGaussian(NamedTuple):
     doubt: Tensor
     told: Tensor
     agreed: Tensor
+    moving: AdaptedNoise
 
     @property
     def beliefs(self) -> Beliefs:
@@ -108,14 +111,16 @@ class BodyGaussian(NamedTuple):
 
 
 class Widened(NamedTuple):
-    """Holds variances that predictions got [*batch, N].
+    """Holds how predictions were wider than usual.
 
     Attributes:
-        jumped: where joints had jumped. carried: where no camera saw a hip.
+        jumped: [*batch, N], variances they got where joints had jumped. carried: where no camera saw a hip.
+        factor: [*batch], of the variances of accelerations.
     """
 
     jumped: Tensor
     carried: Tensor
+    factor: Tensor
 
 
 class Speeds(NamedTuple):
@@ -246,10 +251,25 @@ class BodyKalmanFilter(nn.Module):
         """
         model = self.transition if coasting is None else self.transition_of(coasting)
         mean, matrix = model.ahead(self.motion, state.mean)
-        cov = matrix @ state.cov @ matrix.mT + model.noise
+        cov = matrix @ state.cov @ matrix.mT + self.noise_of(model, state.moving.factor)
         log_odds, doubt = model.next_log_odds(state.log_odds), model.next_doubt(state.doubt)
         later = state._replace(mean=mean, cov=cov, log_odds=log_odds, doubt=doubt)
         return self.pulled(later, model.share)
+
+    def noise_of(
+        self, model: BodyTransition, factor: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "... N N"]:
+        """Return the noise of one frame of bodies whose accelerations vary more or less than on average.
+
+        Args:
+            model: of the frame. factor: of the variances of accelerations.
+        """
+        if len(self.maps.shift) == 1:
+            return model.noise
+        body = self.articulation
+        scale = factor.new_ones(*factor.shape, body.dim)
+        scale[..., : body.columns["velocity"].stop] = factor.sqrt()[..., None]
+        return model.noise * scale[..., None] * scale[..., None, :]
 
     def pulled(self, state: BodyGaussian, share: float) -> BodyGaussian:
         """Return the Gaussian after a share of the information of the priors over poses and leans."""
@@ -457,7 +477,8 @@ class BodyKalmanFilter(nn.Module):
         joints = a.joints(point)
         seen = see(self.maps, joints)
         weighed = weigh(readings, seen, self.maps, state.beliefs, self.exchange)
-        off = (step.pulled * (last.G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
+        moved = (last.G @ step.pulled[..., None]).squeeze(-1)
+        off = (step.pulled * moved).sum(-1)
         fit = -0.5 * off - step.chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         scale, told = self._next_scale(state, readings, seen, weighed, joint_cov)
         after = BodyGaussian(
@@ -468,13 +489,26 @@ class BodyKalmanFilter(nn.Module):
             state.doubt,
             told,
             state.agreed,
+            self._next_moving(state, step, moved, weighed),
         )
         evidence = weighed.log_evidence + fit
         none = torch.zeros_like(step.step)
+        widened = Widened(none, none, state.moving.factor)
         speeds = self._speeds(after, last.H)
-        return CorrectedBody(
-            after, joints, joint_cov, weighed, evidence, Widened(none, none), speeds
-        )
+        return CorrectedBody(after, joints, joint_cov, weighed, evidence, widened, speeds)
+
+    def _next_moving(
+        self,
+        state: BodyGaussian,
+        step: InformationStep,
+        moved: Float[Tensor, "B K"],
+        weighed: Weighed,
+    ) -> AdaptedNoise:
+        """Return how briskly bodies move; one camera does not tell, since what is lifted errs for long."""
+        if len(self.maps.shift) == 1:
+            return state.moving
+        measured = (weighed.inlier.amax(1) > 0.5).to(moved).mean(-1)
+        return state.moving.after(step.pulled, moved, measured, 1 / self.fps)
 
     def _speeds(self, state: BodyGaussian, H: Float[Tensor, "B K N"]) -> Speeds:
         """Return how fast joints move, by the derivative of their places."""

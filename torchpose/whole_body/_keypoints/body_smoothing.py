@@ -69,6 +69,7 @@ def smooth(
     filter: BodyKalmanFilter,
     filtered: BodyMoments,
     widened: Float[Tensor, "B T N"],
+    factor: Float[Tensor, "B T"],
     started: Bool[Tensor, "B T"],
     coasting: Bool[Tensor, "B T"],
 ) -> Iterator[tuple[slice, BodyMoments]]:
@@ -82,6 +83,7 @@ def smooth(
 
     Args:
         filter: that filtered. filtered: posteriors of T frames. widened: variances added to the predictions.
+        factor: of the variances of accelerations in the predictions.
         started: frames in which tracking began anew, which say nothing of the frames before.
         coasting: frames in which nothing was measured.
     """
@@ -92,7 +94,7 @@ def smooth(
         rows = slice(max(0, end - PART), end)
         later = slice(rows.start + 1, end + 1)
         part = _smoothed(
-            filter, part_of(filtered, rows), after, widened[:, later], started[:, later],
+            filter, part_of(filtered, rows), after, widened[:, later], factor[:, later], started[:, later],
             coasting[:, rows],
         )  # fmt: skip
         yield rows, part
@@ -104,6 +106,7 @@ def _smoothed(
     filtered: BodyMoments,
     after: BodyMoments,
     widened: Float[Tensor, "B T N"],
+    factor: Float[Tensor, "B T"],
     started: Bool[Tensor, "B T"],
     coasting: Bool[Tensor, "B T"],
 ) -> BodyMoments:
@@ -111,10 +114,10 @@ def _smoothed(
 
     Args:
         filter: that filtered. filtered: posteriors. after: [B], smoothed, of the frame after the last one.
-        widened, started: of the frames after each of these. coasting: of these.
+        widened, factor, started: of the frames after each of these. coasting: of these.
     """
     body, found = filter.articulation, [after]
-    ahead, predicted, gains = _gains(filter, filtered, widened, started, coasting)
+    ahead, predicted, gains = _gains(filter, filtered, widened, factor, started, coasting)
     for t in range(predicted.shape[1] - 1, -1, -1):
         (mean, cov), expected = frame_at((filtered, ahead), t)
         off = body.difference(found[-1].mean, expected)
@@ -129,18 +132,19 @@ def _gains(
     filter: BodyKalmanFilter,
     filtered: BodyMoments,
     widened: Float[Tensor, "B T N"],
+    factor: Float[Tensor, "B T"],
     started: Bool[Tensor, "B T"],
     coasting: Bool[Tensor, "B T"],
 ) -> tuple[BodyPoint, Tensor, Tensor]:
     """Return means and covariances predicted for the frames after some, and C.
 
     Args:
-        filter: that filtered. filtered: posteriors. widened, started: of the frames after these.
-            coasting: of these.
+        filter: that filtered. filtered: posteriors. widened, factor, started: of the frames after
+            these. coasting: of these.
     """
     model = filter.transition_of(coasting)
     ahead, matrix = model.ahead(filter.motion, filtered.mean)
     carried = matrix @ filtered.cov
-    predicted = carried @ matrix.mT + model.noise + torch.diag_embed(widened)
+    predicted = carried @ matrix.mT + filter.noise_of(model, factor) + torch.diag_embed(widened)
     gains = torch.cholesky_solve(carried, safe_cholesky(predicted)).mT
     return ahead, predicted, gains * ~started[..., None, None]

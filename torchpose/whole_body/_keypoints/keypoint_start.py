@@ -17,6 +17,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.priors._lifting_network import Lifted
+from torchpose.whole_body._keypoints.adapted_noise import AdaptedNoise
 from torchpose.whole_body._keypoints.body_kalman import (
     FEW_INLIERS,
     BodyGaussian,
@@ -182,6 +183,7 @@ def _state(points: BodyPoint, cov: Float[Tensor, "N N"], maps: RigMaps, fps: flo
         new((count, len(BODY_15.names)), _DOUBT),
         new((count, n_cameras), told),
         new((count, len(BODY_15.names), 3), torch.nan),
+        AdaptedNoise.usual(new((count, 3 * len(BODY_15.names)), 0.0)),
     )
 
 

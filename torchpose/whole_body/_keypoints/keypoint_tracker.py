@@ -461,7 +461,7 @@ class KeypointTracker(nn.Module):
         """Return poses for which later frames count too, up to where somebody was found anew.
 
         Args:
-            filtered: with states of `to_be_smoothed`, which are written over. widened: as there [B, T, N].
+            filtered: with states of `to_be_smoothed`, which are written over. widened: as there.
         """
         seen, carriers = filtered.unseen == 0, self.filter.articulation.carriers
         jumped = from_last_seen(widened.jumped, seen, filtered.started, carriers)
@@ -469,7 +469,7 @@ class KeypointTracker(nn.Module):
         states = BodyMoments(poses.point, poses.state_cov)
         wider = jumped + widened.carried
         begun = beginnings(poses.started, poses.coasting, self.filter.fps)
-        for rows, part in smooth(self.filter, states, wider, begun, poses.coasting):
+        for rows, part in smooth(self.filter, states, wider, widened.factor, begun, poses.coasting):
             smoothed = self._as_smoothed(part_of(poses, rows), part)
             write_part(_smoothed_fields(poses), rows, _smoothed_fields(smoothed))
         return poses
