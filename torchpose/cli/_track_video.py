@@ -43,10 +43,8 @@ if TYPE_CHECKING:
     from torchpose.video._writer import VideoWriter
 
 _OVERLAY = "overlay.mp4"
-_GREY, _DARK = (
-    8,
-    50,
-)  # range of R, G and B up to which a pixel is grey, and brightness that shows it
+_GREY = 8  # range of R, G and B up to which a pixel is grey
+_DARK = 50  # brightness of an image too dark to tell
 _LATEST = 300  # frames that are passed over at most for one with a person
 _THROUGHOUT = 0.9  # share of the frames in which a face is seen that nobody doubts
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"

@@ -141,9 +141,8 @@ class FaceTracker(nn.Module):
         self.every, self.whole_every, self.search_every = (
             max(1, round(frames / rate)) for frames in (every, whole_every, search_every)
         )
-        self.farther = max(
-            1.0, self.every * rate / every
-        )  # times as far faces move between searches
+        # times as far as at 30 frames per second faces move from search to search
+        self.farther = max(1.0, self.every * rate / every)
         self.gate, self.min_hits, self.memory = gate, min_hits, memory
         self.std, self.rate = std, rate
         self.acceleration = acceleration * rate**1.5  # a random walk of velocities per frame
