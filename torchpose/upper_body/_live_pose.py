@@ -1,5 +1,6 @@
 """Hold the state of live streams between two frames, and the poses of one frame."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +27,8 @@ class StreamState(NamedTuple):
         method: the name of the method whose state it is. settings: of the tracker whose state it is, as far
             as the numbers depend on them; None if they are not known.
         notes: what was assumed of the keypoints of the stream, as in `PoseTrack.notes`.
+        away: the number of frames since any keypoint was given, [B]. first: the estimator's state before the
+            first frame.
     """
 
     estimator: Any
@@ -37,6 +40,12 @@ class StreamState(NamedTuple):
     method: str | None = None
     settings: StreamSettings | None = None
     notes: tuple[str, ...] = ()
+    away: Tensor | None = None
+    first: Any = None
+
+    def anew(self) -> "StreamState":
+        """Return the state before the first frame of the same streams; random generators go on."""
+        return self._replace(estimator=self.first, motion=None, screen=None)
 
 
 class LivePose(NamedTuple):
@@ -114,3 +123,30 @@ def unseen_frames(before: Int[Tensor, " B"], seen: Bool[Tensor, "B T"]) -> Int[T
     frames = torch.arange(1, n_frames + 1, device=seen.device)
     last = torch.where(seen, frames, torch.zeros_like(frames)).amax(1)
     return torch.where(last > 0, n_frames - last, before + n_frames)
+
+
+def returns(before: Int[Tensor, " B"], there: Bool[Tensor, "B T"], longest: float) -> list[int]:
+    """Return the frames in which somebody is back after all streams showed nobody for long.
+
+    Args:
+        before: frames since anything was there, before these. there: whether anything is, in each.
+        longest: number of frames without anything after which it may be somebody else.
+    """
+    if int(before.min()) + there.shape[1] <= longest:
+        return []
+    frames = torch.arange(there.shape[1], device=there.device)
+    last = torch.where(there, frames, -1 - before[:, None]).cummax(1).values
+    last = torch.cat([-1 - before[:, None], last[:, :-1]], 1)
+    back = (frames - last - 1 > longest).all(0) & there.any(0)
+    found: list[int] = back.nonzero().flatten().tolist()
+    return found
+
+
+def joined(first: PoseTrack, second: PoseTrack) -> PoseTrack:
+    """Return the poses of frames, and of those that follow, of the same streams."""
+    fields: dict[str, Any] = {
+        name: torch.cat([getattr(first, name), getattr(second, name)], 1) for name in FRAME_FIELDS
+    }
+    later = torch.where(second.failed_at < 0, -1, second.failed_at + first.joints3d.shape[1])
+    failed_at = torch.where(first.failed_at < 0, later, first.failed_at)
+    return replace(first, **fields, lengths=first.lengths + second.lengths, failed_at=failed_at)

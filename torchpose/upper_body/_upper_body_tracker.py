@@ -58,7 +58,9 @@ from torchpose.upper_body._live_pose import (
     StreamState,
     check_stream,
     check_stream_method,
+    joined,
     live_pose,
+    returns,
     unseen_frames,
 )
 from torchpose.upper_body._measured_joints import (
@@ -146,7 +148,8 @@ class UpperBodyTracker(WideModule):
         neck: the kind of neck of the keypoints, where their names do not tell it: "neck", "low-neck" or
             "mid-shoulder". A neck of another kind than the prior's is put where the
             prior has it, between the middle of the shoulders and the head, or else not measured.
-        max_gap: the longest time without any keypoint, seconds; None for no bound.
+        max_gap: the longest time without any keypoint, seconds; None for no bound. Longer ones in recordings
+            are refused, and live streams begin anew after them.
         outliers: whether keypoints that belong to no body count as missing, and exchanged hands are
             exchanged back, frame by frame. False takes keypoints as they are.
         **options: the options of the method (`torchpose.upper_body.method_options`), such as
@@ -377,7 +380,7 @@ class UpperBodyTracker(WideModule):
         unseen = torch.zeros(batch_size, dtype=torch.long, device=cov.device)
         return StreamState(
             state, None, unseen, n_keypoints, picked, method=reader.method, settings=self._settings,
-            notes=reader.notes,
+            notes=reader.notes, away=unseen, first=state,
         )  # fmt: skip
 
     @uncompiled
@@ -394,8 +397,9 @@ class UpperBodyTracker(WideModule):
 
         A camera does not stop, so `max_gap` raises nothing here: while nothing is measured the prior
         fills in, covariances grow, and `LivePose.unseen` says for how long it has been so. Whoever comes
-        back after seconds is followed better from a new state, by `init`. Frames
-        that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
+        after more than `max_gap` may be somebody else, and the stream begins anew; several streams of a
+        state do once all of them have shown nobody for so long. Frames that were dropped are to be passed as
+        missing (NaN), since a step is one frame at `fps`.
         Keypoints of a network are to be detached, or the state holds the graph of all frames before.
 
         Args:
@@ -463,6 +467,13 @@ class UpperBodyTracker(WideModule):
             given = self._measure(
                 keypoints, confidence, mask, covariance, absent, state.picked, cov
             )
+            there = given.mask.any(-1)
+            back = self._returns(state, there)
+            if back and back[-1] > 0:
+                others = confidence, mask, covariance, absent
+                return self._in_two(state, keypoints, others, back[-1])
+            if back:
+                state = state.anew()
             reader = self._reader(state.picked.there, state.picked, cov)
             check_stream_method(state, reader.method)
             check_settings(state.settings, self._settings)
@@ -470,8 +481,33 @@ class UpperBodyTracker(WideModule):
             own, estimates = reader.estimator.advance(state.estimator, found.measured)
             motion, track = reader.read(state.motion, estimates, found)
         unseen = unseen_frames(state.unseen, found.measured.mask.any(-1))
-        state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
+        away = None if state.away is None else unseen_frames(state.away, there)
+        state = state._replace(
+            estimator=own, motion=motion, unseen=unseen, screen=screen, away=away
+        )
         return state, track.in_precision(self.dtype)
+
+    def _returns(self, state: StreamState, there: Bool[Tensor, "B T"]) -> list[int]:
+        """Return the frames in which streams begin anew."""
+        if self.max_gap is None or state.away is None:
+            return []
+        return returns(state.away, there, self.max_gap * (self.fps or 30.0))
+
+    def _in_two(
+        self,
+        state: StreamState,
+        keypoints: Tensor,
+        others: Sequence[Tensor | None],
+        frame: int,
+    ) -> tuple[StreamState, PoseTrack]:
+        """Return `advance` of the frames before one, and then of it and those that follow."""
+        earlier, later = (
+            [None if other is None else other[:, rows] for other in others]
+            for rows in (slice(frame), slice(frame, None))
+        )
+        state, before = self.advance(state, keypoints[:, :frame], *earlier)
+        state, after = self.advance(state, keypoints[:, frame:], *later)
+        return state, joined(before, after)
 
     def _refuse_smoothing(self) -> None:
         """Raise `InputError` where later frames are asked for, which streams do not have."""
