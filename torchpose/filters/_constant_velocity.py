@@ -245,7 +245,7 @@ class VelocityFilters:
         matrix, mean, found = self._matrix.to(z), state.mean, []
         for frame, gain in zip(z.unbind(1), gains.unbind(1), strict=True):
             predicted = matrix @ mean
-            mean = predicted + gain * (frame[:, None] - predicted[:, :1])
+            mean = predicted + _correction(predicted, frame, gain)
             found.append(mean[:, 0])
         return VelocityFiltersState(mean, times[:, -1]), torch.stack(found, 1)
 
@@ -256,8 +256,15 @@ def _next(
     """Return the next state, and by how much it differs from its prediction."""
     predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
     gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
-    correction = gain * (z[:, None] - predicted[:, :1])
+    correction = _correction(predicted, z, gain)
     return ConstantVelocityState(predicted + correction, state.time + 1), correction
+
+
+def _correction(
+    predicted: Float[Tensor, "B 2 N"], z: Float[Tensor, "B N"], gain: Float[Tensor, "*shape"]
+) -> Float[Tensor, "B 2 N"]:
+    """Return what numbers z change of predicted positions and velocities."""
+    return gain * (z[:, None] - predicted[:, :1])
 
 
 def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
