@@ -120,9 +120,17 @@ def unseen_frames(before: Int[Tensor, " B"], seen: Bool[Tensor, "B T"]) -> Int[T
     n_frames = seen.shape[1]
     if n_frames == 1:
         return (before + 1).masked_fill(seen[:, 0], 0)
-    frames = torch.arange(1, n_frames + 1, device=seen.device)
-    last = torch.where(seen, frames, torch.zeros_like(frames)).amax(1)
-    return torch.where(last > 0, n_frames - last, before + n_frames)
+    return frames_since(before, seen)[:, -1]
+
+
+def frames_since(before: Int[Tensor, "*batch"], seen: Bool[Tensor, "*batch T"]) -> Tensor:
+    """Return the number of frames since anything was measured, after each of T more, [*batch, T].
+
+    Args:
+        before: that number before them. seen: whether anything was measured in each.
+    """
+    frames = torch.arange(seen.shape[-1], device=seen.device)
+    return frames - torch.where(seen, frames, -1 - before[..., None]).cummax(-1).values
 
 
 def returns(before: Int[Tensor, " B"], there: Bool[Tensor, "B T"], longest: float) -> list[int]:
@@ -134,10 +142,8 @@ def returns(before: Int[Tensor, " B"], there: Bool[Tensor, "B T"], longest: floa
     """
     if int(before.min()) + there.shape[1] <= longest:
         return []
-    frames = torch.arange(there.shape[1], device=there.device)
-    last = torch.where(there, frames, -1 - before[:, None]).cummax(1).values
-    last = torch.cat([-1 - before[:, None], last[:, :-1]], 1)
-    back = (frames - last - 1 > longest).all(0) & there.any(0)
+    away = torch.cat([before[:, None], frames_since(before, there)[:, :-1]], 1)
+    back = (away > longest).all(0) & there.any(0)
     found: list[int] = back.nonzero().flatten().tolist()
     return found
 

@@ -14,7 +14,7 @@ from torchpose._core.inference import usable_anywhere
 from torchpose.errors import InputError
 from torchpose.measure._association import AssociationState, HandAssociation
 from torchpose.measure._keypoint_measurer import FrameKeypoints
-from torchpose.upper_body._live_pose import StreamState
+from torchpose.upper_body._live_pose import StreamState, frames_since
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 from torchpose.video._measurers import Found, MissedFrame
@@ -326,20 +326,14 @@ def without_long_gaps(
         unseen: the number of frames without measurements before these.
         gap: the largest number of frames without measurements that has poses.
     """
-    away = _frames_since(seen, unseen) > gap
+    away = frames_since(torch.tensor(unseen, device=seen.device), seen) > gap
     return _without_poses(poses, away) if bool(away.any()) else poses
-
-
-def _frames_since(seen: Bool[Tensor, " T"], unseen: int) -> Int[Tensor, " T"]:
-    """Return the number of frames since the last one that was seen, after each frame."""
-    frames = torch.arange(len(seen), device=seen.device)
-    last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
-    return frames - last
 
 
 def _frames_unseen(poses: PoseTrack, unseen: int) -> Int[Tensor, " T"]:
     """Return `PersonStreamState.unseen` after each frame: keypoints that are outliers do not count."""
-    return _frames_since(poses.observed[0].any(-1), unseen)
+    seen = poses.observed[0].any(-1)
+    return frames_since(torch.tensor(unseen, device=seen.device), seen)
 
 
 def _frames(poses: PoseTrack, rows: slice) -> PoseTrack:
