@@ -17,7 +17,8 @@ def corrected(moves, measured=ALL):
     """The noise after corrections [T, 45] that keypoints pulled at with their tenfold."""
     noise = AdaptedNoise.usual(moves[:1])
     for move in moves:
-        noise = noise.after(10 * move[None], move[None], measured, DT)
+        pulled, moved = 10 * move[None], move[None]
+        noise = noise.after(pulled, moved, (pulled * moved).sum(-1), measured, DT)
     return float(noise.factor)
 
 

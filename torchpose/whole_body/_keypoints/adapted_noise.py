@@ -45,15 +45,16 @@ class AdaptedNoise(NamedTuple):
         self,
         pulled: Float[Tensor, "B K"],
         moved: Float[Tensor, "B K"],
+        size: Float[Tensor, " B"],
         measured: Float[Tensor, " B"],
         dt: float,
     ) -> "AdaptedNoise":
         """Return the noise of motion after one more correction.
 
         Args:
-            pulled: y. moved: d. measured: share of the joints with a keypoint. dt: seconds of a frame.
+            pulled: y. moved: d. size: y^T d. measured: share of the joints with a keypoint.
+            dt: seconds of a frame.
         """
-        size = (pulled * moved).sum(-1)
         mean = 0.5 * (size + self.size)
         rho = ((pulled * self.moved).sum(-1) / mean.clamp_min(1e-9)).clamp(-1.0, 1.0)
         factor = self.factor * torch.exp(rho * measured * (dt / _TIME))

@@ -489,7 +489,7 @@ class BodyKalmanFilter(nn.Module):
             state.doubt,
             told,
             state.agreed,
-            self._next_moving(state, step, moved, weighed),
+            self._next_moving(state, step, moved, off, weighed),
         )
         evidence = weighed.log_evidence + fit
         none = torch.zeros_like(step.step)
@@ -502,13 +502,14 @@ class BodyKalmanFilter(nn.Module):
         state: BodyGaussian,
         step: InformationStep,
         moved: Float[Tensor, "B K"],
+        size: Float[Tensor, " B"],
         weighed: Weighed,
     ) -> AdaptedNoise:
         """Return how briskly bodies move; one camera does not tell, since what is lifted errs for long."""
         if len(self.maps.shift) == 1:
             return state.moving
         measured = (weighed.inlier.amax(1) > 0.5).to(moved).mean(-1)
-        return state.moving.after(step.pulled, moved, measured, 1 / self.fps)
+        return state.moving.after(step.pulled, moved, size, measured, 1 / self.fps)
 
     def _speeds(self, state: BodyGaussian, H: Float[Tensor, "B K N"]) -> Speeds:
         """Return how fast joints move, by the derivative of their places."""
